@@ -20,8 +20,8 @@ from modp_ti.files.errors import InputError
 from modp_ti.files.run_folder import appearing
 from modp_ti.inputs.delivered_frames import DeliveredFrames
 from modp_ti.outputs.evaluation import MapVersion
-from modp_ti.outputs.formats.colmap_model import image_names
-from modp_ti.outputs.formats.map_folder import NOT_ALWAYS, write_map
+from modp_ti.outputs.formats.dataset import image_names
+from modp_ti.outputs.formats.run_files import NOT_ALWAYS, write_map
 from modp_ti.outputs.formats.splats_ply import write_splats
 from pipelines.companions.block_files import BlockError
 from pipelines.companions.changes import ChangeSweep, EarlierVisit

@@ -24,9 +24,7 @@ from modp_ti.files.run_folder import require_usable
 from modp_ti.files.sole_use import sole_use
 from modp_ti.inputs.delivered_frames import DeliveredFrames
 from modp_ti.outputs.evaluation import FrameScore, MapVersion, evaluate
-from modp_ti.outputs.formats.exposure import read_exposures, write_exposures
-from modp_ti.outputs.formats.keyframe_masks import read_masks
-from modp_ti.outputs.formats.scores_csv import read_scores
+from modp_ti.outputs.formats.run_files import read_exposures, read_masks, read_scores, write_exposures
 from modp_ti.outputs.formats.splats_ply import check_splats, write_splats
 from modp_ti.outputs.lpips import open_lpips
 from modp_ti.outputs.playback.finished_frames import frames_of

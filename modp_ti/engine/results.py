@@ -23,9 +23,8 @@ from modp_ti.files.run_folder import appearing, is_run_folder
 from modp_ti.inputs.delivered_frames import DeliveredFrames
 from modp_ti.inputs.sources.undistortion import Undistorter
 from modp_ti.outputs.evaluation import FrameScore, MapVersion, summary
-from modp_ti.outputs.formats.colmap_model import image_names, write_image
-from modp_ti.outputs.formats.map_folder import NOT_ALWAYS, write_map
-from modp_ti.outputs.formats.scores_csv import write_scores
+from modp_ti.outputs.formats.dataset import image_names, write_image
+from modp_ti.outputs.formats.run_files import NOT_ALWAYS, write_map, write_scores
 from modp_ti.outputs.formats.splats_ply import check_splats
 from modp_ti.outputs.report.page import ReportedRun, write_report
 from modp_ti.outputs.report.pictures import Album

@@ -18,8 +18,7 @@ from modp_ti.engine.snapshots.snapshot import StreamDigest
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.joined_tracker import JoinedTracker, Placement, prefix_for, shift_after
 from modp_ti.inputs.protocol import Tracker
-from modp_ti.outputs.formats.exposure import read_exposures
-from modp_ti.outputs.formats.keyframe_masks import read_masks
+from modp_ti.outputs.formats.run_files import read_exposures, read_masks
 from modp_ti.outputs.locating.locator import Locator
 from modp_ti.outputs.locating.world_alignment import (
     AGREEING,

@@ -17,7 +17,7 @@ from modp_ti.inputs.replay import ReplayedTracker
 from modp_ti.many.finished import finished_metrics
 from modp_ti.many.parts import Part, part_config, parts_of, steps_in_part
 from modp_ti.many.results import figures, last_stage
-from modp_ti.outputs.formats.exposure import read_exposures
+from modp_ti.outputs.formats.run_files import read_exposures
 from modp_ti.outputs.playback.finished_run import FinishedRun, open_run
 from pipelines.settings import RefineSettings
 from pipelines.whole.merge import MappedPart

@@ -22,8 +22,7 @@ from modp_ti.files.number_rows import read_number_rows
 from modp_ti.inputs.tracker_server.messages import Kind, State, encoded, parse_correction, parse_frame
 from modp_ti.inputs.trackers.point_cloud import read_ply_points
 from modp_ti.outputs.evaluation import FrameScore
-from modp_ti.outputs.formats.frames_json import read_frames, write_frames
-from modp_ti.outputs.formats.scores_csv import read_scores, write_scores
+from modp_ti.outputs.formats.run_files import read_frames, read_scores, write_frames, write_scores
 from modp_ti.outputs.formats.splats_ply import read_splats, write_splats
 from modp_ti.outputs.formats.trajectory import read_trajectory, write_trajectory
 

@@ -106,9 +106,7 @@ def _converse(path: Path, data: bytes) -> None:
 
 
 def _read_run(file: Path, out: Path) -> None:
-    from modp_ti.outputs.formats.exposure import read_exposures
-    from modp_ti.outputs.formats.keyframe_masks import read_masks
-    from modp_ti.outputs.formats.scores_csv import read_scores
+    from modp_ti.outputs.formats.run_files import read_exposures, read_masks, read_scores
     from modp_ti.outputs.playback.finished_run import open_run
 
     if file.name == "exposure.json":

@@ -18,7 +18,7 @@ from fields.map.blocks import Boxes, planes_of, seen
 from modp_ti.files.atomic import written_aside
 from modp_ti.files.errors import InputError
 from modp_ti.outputs.formats.gltf import write_mesh_glb
-from modp_ti.outputs.formats.open3d_io import open3d
+from modp_ti.outputs.formats.points_ply import open3d
 from modp_ti.outputs.formats.textured_mesh import TexturedMesh
 from pipelines.surface.distance_field import integrate
 from pipelines.surface.support import supporting_views

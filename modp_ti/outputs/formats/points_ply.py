@@ -1,10 +1,11 @@
-"""`points.ply`: the map as a coloured point cloud."""
+"""Open3D, which is imported on demand, and `points.ply`, the map as a coloured point cloud."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Mapping
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,13 +13,28 @@ from numpy.typing import NDArray
 from fields.frames.origin import NO_ORIGIN
 from fields.map.gaussians import SH_C0
 from modp_ti.files.atomic import written_aside
-from modp_ti.outputs.formats.open3d_io import open3d
+from modp_ti.files.errors import InputError
 from modp_ti.outputs.formats.splat_packing import opacities
 
-__all__ = ["write_points"]
+__all__ = ["open3d", "write_points"]
 
 # Gaussians below this opacity are haze rather than surface.
 LEAST_OPACITY = 0.5
+
+
+def open3d() -> ModuleType:
+    """Import and return Open3D.
+
+    Raises:
+        InputError: If the import fails, most often because of a missing system library.
+    """
+    try:
+        import open3d
+    except (ImportError, OSError) as error:
+        raise InputError(
+            f"Open3D does not start ({error}); on Debian or Ubuntu: apt-get install libusb-1.0-0 libgomp1 libgl1"
+        ) from None
+    return open3d
 
 
 def write_points(

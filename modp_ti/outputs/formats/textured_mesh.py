@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from fields.geometry.camera import PinholeCamera
 from modp_ti.files.errors import InputError
-from modp_ti.outputs.formats.open3d_io import open3d
+from modp_ti.outputs.formats.points_ply import open3d
 from pipelines.surface.painting import Paint
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from fields.frames.origin import shifted_poses
 from modp_ti.files.errors import InputError
 from modp_ti.files.run_folder import list_files, refuse_foreign
 from modp_ti.outputs.formats.compressed_ply import write_compressed_ply
-from modp_ti.outputs.formats.datasets import new_folder, rename_images, write_transforms
+from modp_ti.outputs.formats.dataset import new_folder, rename_images, write_transforms
 from modp_ti.outputs.formats.gltf import write_splat_glb
 from modp_ti.outputs.formats.mesh import MESH_SUFFIXES, TRUNCATION, extracted, fused, supported, write_mesh
 from modp_ti.outputs.formats.points_ply import write_points

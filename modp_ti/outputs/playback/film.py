@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from modp_ti.files.atomic import written_aside
 from modp_ti.files.errors import InputError
-from modp_ti.outputs.formats.datasets import new_folder
+from modp_ti.outputs.formats.dataset import new_folder
 from modp_ti.outputs.playback.map_renderer import eight_bits
 from pipelines.render.renderer import RenderedView
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from fields.frames.origin import shifted_poses
 from fields.geometry.camera import PinholeCamera
 from modp_ti.files.errors import InputError
-from modp_ti.outputs.formats.exposure import read_exposures
+from modp_ti.outputs.formats.run_files import read_exposures
 from modp_ti.outputs.formats.trajectory import read_trajectory
 from modp_ti.outputs.playback.camera_paths import orbit, smoothed
 from modp_ti.outputs.playback.film import depth_colours, is_video, require_writable, write_pictures, write_video

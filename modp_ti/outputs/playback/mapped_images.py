@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modp_ti.files.errors import InputError
-from modp_ti.outputs.formats.colmap_model import image_names, write_image
+from modp_ti.outputs.formats.dataset import image_names, write_image
 from modp_ti.outputs.playback.finished_run import FinishedRun
 from modp_ti.outputs.playback.run_pictures import kept_images, pictures
 from modp_ti.outputs.progress import ProgressLine

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from fields.geometry.camera import PinholeCamera
 from modp_ti.files.errors import InputError
-from modp_ti.outputs.formats.frames_json import FramesRecord
+from modp_ti.outputs.formats.run_files import FramesRecord
 from modp_ti.outputs.formats.splats_ply import read_splats
 from modp_ti.outputs.playback.camera_paths import looking_at
 from modp_ti.outputs.playback.finished_run import FinishedRun

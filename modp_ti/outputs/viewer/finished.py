@@ -18,7 +18,7 @@ from modp_ti.files.errors import InputError
 from modp_ti.inputs.sources.image_header import why_undecodable
 from modp_ti.inputs.sources.image_pixels import decoded
 from modp_ti.inputs.trackers.colmap_files import read_colmap_model
-from modp_ti.outputs.formats.exposure import read_exposures
+from modp_ti.outputs.formats.run_files import read_exposures
 from modp_ti.outputs.playback.finished_run import FinishedRun
 from modp_ti.outputs.playback.map_renderer import MapRenderer, start_device
 from modp_ti.outputs.viewer.handover import BrowserCamera, Latest

@@ -19,7 +19,7 @@ from modp_ti.commands.app import app
 from modp_ti.config.settings import SourceSettings
 from modp_ti.config.tracker_settings import TransformsSettings
 from modp_ti.inputs.trackers.transforms import open_transforms
-from modp_ti.outputs.formats.exposure import write_exposures
+from modp_ti.outputs.formats.run_files import write_exposures
 from modp_ti.outputs.formats.splats_ply import read_splats
 from modp_ti.outputs.formats.trajectory import read_trajectory, write_trajectory
 from modp_ti.outputs.playback.finished_run import open_run

@@ -15,7 +15,7 @@ from modp_ti.engine import refined_run
 from modp_ti.engine.refined_run import refine_run
 from modp_ti.engine.snapshots.file import FILE
 from modp_ti.files.run_folder import PRIVATE
-from modp_ti.outputs.formats.scores_csv import read_scores
+from modp_ti.outputs.formats.run_files import read_scores
 from modp_ti.outputs.formats.splats_ply import read_splats
 from modp_ti.outputs.playback.finished_run import open_run
 

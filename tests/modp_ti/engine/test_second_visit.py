@@ -20,8 +20,7 @@ from fields.frames.origin import shifted_poses
 from fields.geometry.se3 import exp_se3, inverse_se3
 from fields.geometry.similarity import moved_points, moved_pose
 from modp_ti.engine.snapshots.file import FILE
-from modp_ti.outputs.formats.keyframe_masks import read_masks
-from modp_ti.outputs.formats.scores_csv import read_scores
+from modp_ti.outputs.formats.run_files import read_masks, read_scores
 from modp_ti.outputs.formats.splats_ply import read_splats
 from modp_ti.outputs.formats.trajectory import read_trajectory, write_trajectory
 from modp_ti.outputs.playback.finished_run import open_run

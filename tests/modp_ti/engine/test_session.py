@@ -26,7 +26,7 @@ from modp_ti.inputs.delivered_frames import DeliveredFrames
 from modp_ti.inputs.replay import ReplayedTracker
 from modp_ti.inputs.trackers import Tracker, open_tracker
 from modp_ti.outputs.evaluation import summary
-from modp_ti.outputs.formats.scores_csv import read_scores
+from modp_ti.outputs.formats.run_files import read_scores
 from modp_ti.outputs.formats.splats_ply import read_splats
 from modp_ti.outputs.formats.trajectory import read_trajectory
 from modp_ti.outputs.lpips import open_lpips

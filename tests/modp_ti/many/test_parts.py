@@ -15,7 +15,7 @@ from modp_ti.commands.app import app
 from modp_ti.config.scene_file import load_scene
 from modp_ti.many import parts as mapping
 from modp_ti.many.results import SceneResult, State
-from modp_ti.outputs.formats.scores_csv import read_scores
+from modp_ti.outputs.formats.run_files import read_scores
 from modp_ti.outputs.playback.finished_run import open_run
 from tests.modp_ti.runs import FILES
 from tests.room import Room, RoomRecording, pinhole, walk

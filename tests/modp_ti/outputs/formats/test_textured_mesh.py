@@ -14,7 +14,7 @@ import trimesh
 from fields.geometry.camera import PinholeCamera
 from modp_ti.files.errors import InputError
 from modp_ti.outputs.formats.mesh import write_mesh
-from modp_ti.outputs.formats.open3d_io import open3d
+from modp_ti.outputs.formats.points_ply import open3d
 from modp_ti.outputs.formats.textured_mesh import TexturedMesh, painted, unwrapped
 from tests.room import look_at
 

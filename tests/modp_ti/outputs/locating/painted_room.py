@@ -16,7 +16,7 @@ from modp_ti.inputs.delivered_frames import DeliveredFrames
 from modp_ti.inputs.sources.distortion import NO_DISTORTION, Distortion
 from modp_ti.inputs.sources.undistortion import Undistorter
 from modp_ti.outputs.evaluation import MapVersion
-from modp_ti.outputs.formats.map_folder import write_map
+from modp_ti.outputs.formats.run_files import write_map
 from tests.room import Room, RoomRecording, pinhole, walk
 
 CAMERA = pinhole(240, 180)

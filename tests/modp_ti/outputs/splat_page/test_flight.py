@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from fields.geometry.camera import PinholeCamera
-from modp_ti.outputs.formats.frames_json import FramesRecord
+from modp_ti.outputs.formats.run_files import FramesRecord
 from modp_ti.outputs.playback.camera_paths import looking_at
 from modp_ti.outputs.playback.finished_run import FinishedRun
 from modp_ti.outputs.splat_page.flight import DEPTH, level, moved, viewer_settings

@@ -15,7 +15,7 @@ from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import inverse_se3, quaternion_from_matrix
 from modp_ti.commands.app import app
 from modp_ti.config.settings import ViewSettings
-from modp_ti.outputs.formats.frames_json import FramesRecord
+from modp_ti.outputs.formats.run_files import FramesRecord
 from modp_ti.outputs.formats.splats_ply import write_splats
 from modp_ti.outputs.playback.finished_run import FinishedRun
 from modp_ti.outputs.playback.map_renderer import MapRenderer

@@ -15,7 +15,7 @@ from modp_ti.config.settings import SourceSettings
 from modp_ti.config.tracker_settings import ColmapSettings
 from modp_ti.inputs.tracked_points import TrackedPoints
 from modp_ti.inputs.trackers.colmap import open_colmap
-from modp_ti.outputs.formats.colmap_model import image_names, write_colmap, write_image
+from modp_ti.outputs.formats.dataset import image_names, write_colmap, write_image
 
 CAMERAS = [PinholeCamera(50.0, 51.0, 20.5, 14.0, 40, 30), PinholeCamera(55.0, 55.0, 20.0, 15.0, 40, 30)]
 NAMES = ["left/frame2.jpg", "left/frame10.jpg", "right/a.png"]

@@ -1,0 +1,321 @@
+"""The files of a run that later commands read again: the map, its frames, their exposures, masks and scores."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+import math
+import os
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from fields.frames.origin import NO_ORIGIN, shifted_poses
+from fields.geometry.camera import PinholeCamera
+from fields.map.keyframes import KeyframeStore
+from modp_ti.files import LARGEST, read_bytes, read_json, readable, text_lines
+from modp_ti.files.atomic import replace_text, replacing
+from modp_ti.files.errors import InputError
+from modp_ti.inputs.delivered_frames import DeliveredFrames
+from modp_ti.inputs.sources.distortion import NO_DISTORTION, Distortion
+from modp_ti.inputs.sources.image_header import why_undecodable
+from modp_ti.inputs.sources.intrinsics import Intrinsics, require_plausible
+from modp_ti.inputs.sources.image_pixels import decoded_as
+from modp_ti.inputs.sources.undistortion import Undistorter
+from modp_ti.outputs.evaluation import FrameScore, MapVersion
+from modp_ti.outputs.formats.dataset import write_colmap
+from modp_ti.outputs.formats.splats_ply import write_splats
+from modp_ti.outputs.formats.trajectory import write_trajectory
+from pipelines.render.cpu.photometric_model import IDENTITY
+
+__all__ = [
+    "NOT_ALWAYS",
+    "FramesRecord",
+    "read_exposures",
+    "read_frames",
+    "read_masks",
+    "read_scores",
+    "write_exposures",
+    "write_frames",
+    "write_map",
+    "write_masks",
+    "write_scores",
+]
+
+NOT_ALWAYS = ("colmap", "exposure.json", "masks")
+"""What `write_map` writes that another map may lack, or have other files in."""
+
+# The parts of a lens that are always written.
+LENS = ("numerator", "denominator", "tangential", "fisheye")
+COLUMNS = [field.name for field in dataclasses.fields(FrameScore) if field.name != "still"]
+
+
+def write_map(
+    folder: Path,
+    version: MapVersion,
+    frames: DeliveredFrames,
+    names: Sequence[str],
+    keyframes: KeyframeStore,
+    near: float,
+    undistorter: Undistorter | None = None,
+) -> None:
+    """Write `splats.ply`, `trajectory.txt`, `frames.json` and `colmap/`.
+
+    `exposure.json` is added where exposures are estimated, and `masks/` where keyframes are masked.
+
+    Args:
+        folder: An existing folder.
+        version: The map.
+        frames: Metadata and points of all frames.
+        names: Image names for the COLMAP model.
+        keyframes: The map's keyframes.
+        near: Depth below which nothing is drawn [scene units].
+        undistorter: Undistorter of the first frame's image, None if it is not known.
+    """
+    selected = {keyframe.index for keyframe in keyframes.selected}
+    origin = frames.from_origin
+    poses = [shifted_poses(T, origin) for T in version.trajectory]
+    write_splats(folder / "splats.ply", version.gaussians, origin)
+    write_trajectory(folder / "trajectory.txt", frames.timestamp, poses)
+    write_colmap(folder / "colmap", names, frames.camera, poses, frames.points, origin)
+    lines = [line for line, index in enumerate(frames.index) if index in selected]
+    held_out = [line for line, held in enumerate(frames.held_out) if held]
+    write_frames(folder / "frames.json", near, keyframes.scene_depth, lines, held_out, undistorter, origin)
+    if any(exposure is not None for exposure in version.exposures):
+        estimated = {keyframe.index for keyframe in keyframes if keyframe.exposure is not None}
+        write_exposures(folder / "exposure.json", frames.index, frames.timestamp, version.exposures, estimated)
+    places = {index: place for place, index in enumerate(frames.index)}
+    masks = {places[view.index]: view.transient for view in keyframes if view.transient is not None}
+    if masks:
+        write_masks(folder / "masks", masks)
+
+
+@contextmanager
+def _of_a_run(path: Path, what: str) -> Iterator[None]:
+    """Turn what reading a damaged file raises into one InputError."""
+    try:
+        yield
+    except (ValueError, KeyError, TypeError, OverflowError) as error:
+        raise InputError(f"{path}: cannot be read as the {what} of a run: {error!r:.80}") from None
+
+
+# ---- frames.json: facts that later commands need and no other file contains --------------------------------------
+
+
+@dataclass(frozen=True)
+class FramesRecord:
+    """Content of `frames.json`.
+
+    Attributes:
+        near: Depth below which nothing is drawn [scene units].
+        scene_depth: Median depth of the keyframes' views [scene units].
+        keyframes: Ascending positions of the keyframes in trajectory.txt.
+        held_out: Ascending positions of the held-out frames in trajectory.txt.
+        stored_camera: Camera of the images as stored, before they were undistorted and scaled, of the first frame;
+            None if it is not known.
+        origin: Where the origin of the splats lies in the world of trajectory.txt and colmap/ (3,).
+    """
+
+    near: float
+    scene_depth: float
+    keyframes: list[int]
+    held_out: list[int]
+    stored_camera: Intrinsics | None = None
+    origin: NDArray[np.float64] = field(default_factory=lambda: NO_ORIGIN)
+
+
+def write_frames(
+    path: Path,
+    near: float,
+    scene_depth: float,
+    keyframes: Collection[int],
+    held_out: Collection[int],
+    undistorter: Undistorter | None = None,
+    origin: NDArray[np.float64] = NO_ORIGIN,
+) -> None:
+    """Write the record, with `undistorter` that of the first frame's image. Numbers are read back exactly."""
+    record: dict[str, Any] = {
+        "near": float(near),
+        "scene_depth": float(scene_depth),
+        "keyframes": sorted(keyframes),
+        "held_out": sorted(held_out),
+    }
+    if undistorter is not None:
+        lens = asdict(undistorter.distortion)
+        lens = {name: value for name, value in lens.items() if name in LENS or value != asdict(NO_DISTORTION)[name]}
+        record["stored_camera"] = asdict(undistorter.raw) | {"distortion": lens}
+    if origin.any():
+        record["origin"] = origin.tolist()
+    text = ",\n ".join(f'"{name}": {json.dumps(value)}' for name, value in record.items())
+    replace_text(path, f"{{{text}}}\n")
+
+
+def read_frames(path: Path, count: int) -> FramesRecord:
+    """Read the record of a run of `count` frames.
+
+    Raises:
+        InputError: If the file is damaged or does not fit `count`.
+    """
+    with _of_a_run(path, "frames"):
+        data = read_json(path, "of a finished run")
+        record = FramesRecord(
+            float(data["near"]),
+            float(data["scene_depth"]),
+            list(data["keyframes"]),
+            list(data["held_out"]),
+            _stored_camera(data["stored_camera"], path) if "stored_camera" in data else None,
+            np.array(data.get("origin", NO_ORIGIN), dtype=np.float64).reshape(3),
+        )
+        if not np.isfinite(record.origin).all():
+            raise ValueError("origin must be three finite numbers")
+        if not (0 < record.near < math.inf and 0 < record.scene_depth < math.inf and record.keyframes):
+            raise ValueError("near and scene_depth must be positive, and keyframes must name some")
+        indices = [*record.keyframes, *record.held_out]
+        if not all(type(index) is int and 0 <= index < count for index in indices):
+            raise ValueError(f"names frames beyond the {count} that trajectory.txt has")
+        return record
+
+
+def _stored_camera(data: Mapping[str, Any], path: Path) -> Intrinsics:
+    lens = data["distortion"]
+    numerator, denominator = (tuple(map(float, lens[name])) for name in ("numerator", "denominator"))
+    p1, p2 = map(float, lens["tangential"])
+    fx, fy, cx, cy = (float(data[name]) for name in ("fx", "fy", "cx", "cy"))
+    camera = PinholeCamera(fx, fy, cx, cy, int(data["width"]), int(data["height"]))
+    more = {name: value for name, value in lens.items() if name not in LENS}
+    s1, s2, s3, s4 = map(float, more.pop("prism", NO_DISTORTION.prism))
+    distortion = Distortion(numerator, denominator, (p1, p2), bool(lens["fisheye"]), (s1, s2, s3, s4), **more)
+    return Intrinsics(*require_plausible(camera, distortion, f"{path}: stored_camera"))
+
+
+# ---- exposure.json: the estimated exposure of every frame --------------------------------------------------------
+
+
+def write_exposures(
+    path: Path,
+    indices: Sequence[int],
+    timestamps: Sequence[float],
+    exposures: Sequence[NDArray[np.float64] | None],
+    keyframes: set[int],
+) -> None:
+    """Write the exposure (A, b) of every frame, which maps the map's `colour` to A colour + b.
+
+    Args:
+        path: The file.
+        indices: Indices of the frames.
+        timestamps: Their time stamps [s].
+        exposures: (3, 4) matrix (A, b) of each frame. None is written as the identity.
+        keyframes: Indices of the frames whose exposure was estimated. The others are interpolated.
+    """
+    frames = [
+        {
+            "index": index,
+            "timestamp": timestamp,
+            "keyframe": index in keyframes,
+            "matrix": np.round(IDENTITY if exposure is None else exposure, 6).tolist(),
+        }
+        for index, timestamp, exposure in zip(indices, timestamps, exposures, strict=True)
+    ]
+    lines = ",\n".join("  " + json.dumps(frame) for frame in frames)
+    replace_text(path, f'{{"frames": [\n{lines}\n]}}\n')
+
+
+def read_exposures(path: Path) -> dict[int, NDArray[np.float64]]:
+    """Read exposures (A, b) (3, 4) by frame index. The result is empty if the file does not exist.
+
+    Raises:
+        InputError: If the file is damaged.
+    """
+    if not path.is_file():
+        return {}
+    with _of_a_run(path, "exposures"):
+        frames = read_json(path, "of a finished run")["frames"]
+        found = {int(frame["index"]): np.array(frame["matrix"], dtype=np.float64).reshape(3, 4) for frame in frames}
+        if not all((np.abs(matrix) <= LARGEST).all() for matrix in found.values()):
+            raise ValueError("NaN or infinite numbers")
+        return found
+
+
+# ---- masks/: the parts of keyframes that the map does not follow, as they move or have changed since -------------
+
+
+def write_masks(folder: Path, masks: Mapping[int, NDArray[np.uint8]]) -> None:
+    """Write the masks of keyframes, as grey PNG images.
+
+    Args:
+        folder: The folder, which is made.
+        masks: Weights (h, w) by the position of the frame, see `Keyframe.transient`.
+    """
+    folder.mkdir()
+    for place, mask in masks.items():
+        (folder / f"{place:06d}.png").write_bytes(cv2.imencode(".png", mask)[1].tobytes())
+
+
+def read_masks(folder: Path) -> dict[int, NDArray[np.uint8]]:
+    """Read the masks (h, w) by the position of the frame. The result is empty if the folder does not exist.
+
+    Raises:
+        InputError: If a file is damaged.
+    """
+    masks = {}
+    for path in sorted(folder.glob("*.png")):
+        with readable(path):
+            data = read_bytes(path)
+        reason = why_undecodable(data)
+        mask = decoded_as(data, cv2.IMREAD_UNCHANGED) if reason is None else None
+        if mask is None or mask.ndim != 2 or mask.dtype != np.uint8 or not path.stem.isdecimal():
+            raise InputError(f"{path}: no mask of a run: {reason or 'it must be a grey image, named by its frame'}")
+        masks[int(path.stem)] = mask
+    return masks
+
+
+# ---- scores.csv: one line per frame and version of the map -------------------------------------------------------
+
+
+def write_scores(path: str | os.PathLike[str], scores: Iterable[FrameScore]) -> None:
+    """Write the scores with a header line.
+
+    The columns are index, name, held_out (0 or 1), stage, psnr [dB], ssim, lpips and detail (both empty if not
+    computed). Numbers are written with enough digits to be read back exactly.
+    """
+    with replacing(path, "w") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(COLUMNS)
+        for score in scores:
+            values = (getattr(score, name) for name in COLUMNS)
+            writer.writerow(int(v) if isinstance(v, bool) else v for v in values)
+
+
+def read_scores(path: str | os.PathLike[str]) -> list[FrameScore]:
+    """Read a file that `write_scores` wrote.
+
+    Raises:
+        InputError: If the file is not valid. The message names the line.
+    """
+    file = Path(path)
+    try:
+        rows = list(csv.reader(text_lines(file)))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise InputError(f"{file}: cannot be read as scores: {reason}") from None
+    if not rows or rows[0] != COLUMNS:
+        raise InputError(f"{file}:1: the columns must be {','.join(COLUMNS)}")
+    scores = []
+    for number, row in enumerate(rows[1:], start=2):
+        try:
+            index, name, held_out, stage, *figures = row
+            psnr, ssim, lpips, detail = (float(value) if value else None for value in figures)
+            if psnr is None or ssim is None:
+                raise ValueError
+            held = {"0": False, "1": True}[held_out]
+            scores.append(FrameScore(int(index), name, held, stage, psnr, ssim, lpips, detail))
+        except (ValueError, KeyError):
+            raise InputError(f"{file}:{number}: not a line of scores") from None
+    return scores
