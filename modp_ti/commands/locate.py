@@ -47,8 +47,7 @@ def locate(
     with outcome(as_json) as result:
         # Imported here, so that `--help` does not wait for Taichi and the readers to load.
         from modp_ti.outputs.formats.trajectory import tum_line
-        from modp_ti.outputs.locating.locator import Locator
-        from modp_ti.outputs.locating.picture import given_camera
+        from modp_ti.outputs.locating.locator import Locator, given_camera
         from modp_ti.outputs.progress import ProgressLine
 
         console = progress_console(quiet)

@@ -20,7 +20,7 @@ EXAMPLES = examples(
     "modp-ti render out/room --path mine.txt -o pictures/   (poses of your own)",
 )
 
-# The same names as in modp_ti.outputs.playback.flight, whose import would load Taichi.
+# The same names as in modp_ti.outputs.playback.film, whose import would load Taichi.
 PATH_NAMES = ("recorded", "smoothed", "orbit")
 
 
@@ -76,9 +76,8 @@ def render(
     """Render a finished map along the recorded path, a smoothed one, an orbit, or any path of your own."""
     with outcome(as_json) as result:
         # Imported here, so that `--help` does not wait for Taichi and the readers to load.
-        from modp_ti.outputs.playback.film import is_video
+        from modp_ti.outputs.playback.film import film, is_video, plan_flight
         from modp_ti.outputs.playback.finished_run import open_run
-        from modp_ti.outputs.playback.flight import film, plan_flight
         from modp_ti.outputs.progress import ProgressLine
 
         line = ProgressLine(progress_console(quiet))

@@ -13,7 +13,7 @@ from modp_ti.engine.interruption import Interruption
 from modp_ti.engine.mapper import Mapper
 from modp_ti.engine.prefetch import FramesAhead
 from modp_ti.files.errors import InputError
-from modp_ti.outputs.live_status import LiveStatus
+from modp_ti.outputs.progress import LiveStatus
 from pipelines.companions.pace import Pace
 from pipelines.pipeline import FrameReport
 from pipelines.refinement import Schedule, in_seconds

@@ -16,12 +16,10 @@ from fields.geometry.camera import PinholeCamera
 from modp_ti.config.settings import ViewSettings
 from modp_ti.engine.mapper import Mapper
 from modp_ti.engine.observer import Observer
-from modp_ti.outputs.live_status import LiveStatus
-from modp_ti.outputs.viewer.budget import CostLimit, ThreadClock
-from modp_ti.outputs.viewer.handover import BrowserCamera, Gate, Latest
-from modp_ti.outputs.viewer.modes import SPLATS, Photograph, painter
+from modp_ti.outputs.progress import LiveStatus
+from modp_ti.outputs.viewer.handover import BrowserCamera, CostLimit, Gate, Latest, ThreadClock
+from modp_ti.outputs.viewer.modes import SPLATS, Photograph, painter, splats_of
 from modp_ti.outputs.viewer.page import Page, ShownFrame
-from modp_ti.outputs.viewer.splats import splats_of
 from pipelines.pipeline import FrameReport
 from pipelines.render.renderer import RenderedView
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from fields.frames.tracked_frame import TrackedFrame
 from modp_ti.engine.mapper import Mapper
-from modp_ti.outputs.live_status import LiveStatus
+from modp_ti.outputs.progress import LiveStatus
 from pipelines.pipeline import FrameReport
 
 __all__ = ["Observer"]

@@ -26,8 +26,7 @@ from modp_ti.outputs.evaluation import FrameScore, MapVersion, summary
 from modp_ti.outputs.formats.dataset import image_names, write_image
 from modp_ti.outputs.formats.run_files import NOT_ALWAYS, write_map, write_scores
 from modp_ti.outputs.formats.splats_ply import check_splats
-from modp_ti.outputs.report.page import ReportedRun, write_report
-from modp_ti.outputs.report.pictures import Album
+from modp_ti.outputs.report.page import Album, ReportedRun, write_report
 from modp_ti.outputs.report.record import RunRecord
 
 __all__ = ["Results", "metrics_of", "summary_of"]

@@ -43,8 +43,7 @@ from modp_ti.inputs.trackers import Tracker, open_tracker
 from modp_ti.outputs.evaluation import FrameScore, MapVersion, evaluate, trajectory_errors
 from modp_ti.outputs.lpips import open_lpips
 from modp_ti.outputs.progress import ProgressLine, StageProgress
-from modp_ti.outputs.report.record import RunRecord, StepNote
-from modp_ti.outputs.retention import mapped_psnr, retention
+from modp_ti.outputs.report.record import RunRecord, StepNote, mapped_psnr, retention
 from modp_ti.outputs.time_left import TimeAfterMapping
 from pipelines.companions.block_files import BlockError
 from pipelines.companions.pace import CompletePace

@@ -1,4 +1,4 @@
-"""The progress line of a run: frames, keyframes, Gaussians, PSNR, frames per second, and the time left."""
+"""The progress line of a run, with the time left, and the figures of a realtime run."""
 
 from __future__ import annotations
 
@@ -16,15 +16,40 @@ from modp_ti.files.urls import without_secrets
 from modp_ti.outputs.time_left import TimeLeft, duration
 
 if TYPE_CHECKING:
-    from modp_ti.outputs.live_status import LiveStatus
     from pipelines.pipeline import FrameReport
 
-__all__ = ["ProgressLine", "StageProgress", "progress_ending"]
+__all__ = ["LiveStatus", "ProgressLine", "StageProgress", "progress_ending"]
 
 T = TypeVar("T")
-
 # Time between two progress lines in a log [s].
 LOG_EVERY = 30.0
+
+
+@dataclass(frozen=True)
+class LiveStatus:
+    """The recent figures of a realtime run.
+
+    Attributes:
+        camera: Frames per second that arrive.
+        tracked: Frames per second that get a pose.
+        lag: Time from the last mapped frame's arrival to the map that holds it [s].
+        waiting: Number of frames that wait for the mapper.
+        steps: Mean number of optimisation steps of the last keyframes.
+    """
+
+    camera: float
+    tracked: float
+    lag: float
+    waiting: int
+    steps: float
+
+    def text(self) -> str:
+        """Return the figures in one line."""
+        return (
+            f"lag {self.lag:.1f} s, {self.waiting} waiting, camera {self.camera:.1f}/s, tracked {self.tracked:.1f}/s, "
+            f"{self.steps:.1f} steps a keyframe"
+        )
+
 
 _shown: set[ProgressLine] = set()
 

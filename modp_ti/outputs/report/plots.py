@@ -1,4 +1,4 @@
-"""The report's drawings. Each function returns an SVG as text."""
+"""The report's drawings, each as SVG text, and the numbers and the view from above behind them."""
 
 from __future__ import annotations
 
@@ -6,25 +6,41 @@ import functools
 import io
 import logging
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ParamSpec
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fields.geometry.se3 import camera_centres
+from fields.map.gaussians import SH_C0
 from modp_ti.outputs.evaluation import FrameScore
-from modp_ti.outputs.report.curves import binned, frame_rate, shifts_and_turns
-from modp_ti.outputs.report.plan import Plan
 from modp_ti.outputs.report.record import FrameNote, StepNote
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["growth", "pace", "pose_changes", "psnr_of_frames", "steps", "trajectory"]
+__all__ = [
+    "Plan",
+    "binned",
+    "floor_plan",
+    "frame_rate",
+    "growth",
+    "pace",
+    "plan_of",
+    "pose_changes",
+    "psnr_of_frames",
+    "shifts_and_turns",
+    "steps",
+    "trajectory",
+]
 
-Arguments = ParamSpec("Arguments")
-
+# Maximum number of points of a curve. More would not be visible.
+MOST_POINTS = 400
+# Maximum number of Gaussians drawn, and their minimum opacity.
+MOST_SHOWN = 20_000
+LEAST_OPACITY = 0.5
 WIDTH = 9.2  # inches; the page scales it
 PANEL = 1.15  # width over height of a view from above
 # Colours that differ in print and for colour-blind readers (Okabe and Ito).
@@ -47,6 +63,119 @@ DARK = """@media screen and (prefers-color-scheme: dark) { text { fill: #ddd !im
 [style*="fill: #ffffff"] { fill: none !important } [style*="stroke: #e4e4e4"] { stroke: #34373c !important }
 [style*="stroke: #000000"] { stroke: #bbb !important } [style*="stroke: #666666"] { stroke: #aaa !important }
 [style*="stroke: #0072b2"] { stroke: #4aa8e0 !important } [style*="fill: #0072b2"] { fill: #4aa8e0 !important } }"""
+
+
+def frame_rate(frames: Sequence[FrameNote], window: int) -> NDArray[np.float64]:
+    """Return frames per second (N,) over the `window` frames that end at each frame.
+
+    The first `window - 1` values are NaN. If there are fewer frames than `window`, the last value is the rate over all
+    of them.
+    """
+    done = np.array([0.0, *(note.done for note in frames)])
+    window = min(window, len(frames))
+    rate = np.full(len(frames), np.nan)
+    rate[window - 1 :] = window / np.maximum(done[window:] - done[:-window], 1e-9)
+    return rate
+
+
+def binned(
+    x: NDArray[np.float64], y: NDArray[np.float64], points: int = MOST_POINTS
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Average neighbouring finite values into at most `points` bins, and return the means of x and y."""
+    finite = np.isfinite(y)
+    x, y = x[finite], y[finite]
+    parts = max(1, min(points, len(x)))
+    return (
+        np.array([part.mean() for part in np.array_split(x, parts) if len(part)]),
+        np.array([part.mean() for part in np.array_split(y, parts) if len(part)]),
+    )
+
+
+def shifts_and_turns(
+    before: Sequence[NDArray[np.float64]], after: Sequence[NDArray[np.float64]]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return how far each camera moved [scene units] and turned [degrees].
+
+    Args:
+        before: T_camera_world (4, 4) of every frame.
+        after: The same frames' poses after the change.
+    """
+    a, b = np.asarray(before), np.asarray(after)
+    R_a, R_b = a[:, :3, :3], b[:, :3, :3]
+    # |R - I|^2 = 8 sin^2(angle / 2): exact for small angles, where the arc cosine of the trace is not.
+    difference = np.linalg.norm(R_b @ R_a.transpose(0, 2, 1) - np.eye(3), axis=(1, 2))
+    turns = 2 * np.arcsin(np.minimum(difference / np.sqrt(8.0), 1.0))
+    return np.linalg.norm(camera_centres(b) - camera_centres(a), axis=1), np.degrees(turns)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Axes of a view from above.
+
+    Attributes:
+        right: (3,) unit vector to the right of the page.
+        ahead: (3,) unit vector to the top of the page.
+        up: (3,) unit vector towards the reader.
+    """
+
+    right: NDArray[np.float64]
+    ahead: NDArray[np.float64]
+    up: NDArray[np.float64]
+
+    def on_page(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Project world points (N, 3) to the page (N, 2)."""
+        return points @ np.stack([self.right, self.ahead], axis=1)
+
+
+def plan_of(poses: Sequence[NDArray[np.float64]]) -> Plan:
+    """Return the plan for cameras at T_camera_world (4, 4).
+
+    Up is the cameras' mean up direction. The longest extent of the path is horizontal, and the first camera faces the
+    top of the page.
+    """
+    T = np.asarray(poses)
+    rotations = T[:, :3, :3]
+    centres = camera_centres(T)
+    up = _unit(-rotations[:, 1].mean(axis=0), -rotations[0, 1])
+    flat = centres - centres.mean(axis=0)
+    flat = flat - np.outer(flat @ up, up)
+    axes = np.linalg.svd(flat, full_matrices=True)[2]
+    anyhow = np.cross(np.eye(3)[np.argmin(np.abs(up))], up)
+    right = axes[0] - (axes[0] @ up) * up
+    right = _unit(right if np.abs(flat).max() > 1e-9 else rotations[0, 0] - (rotations[0, 0] @ up) * up, anyhow)
+    ahead = np.cross(up, right)
+    if rotations[0, 2] @ ahead < 0:
+        right, ahead = -right, -ahead
+    return Plan(right, ahead, up)
+
+
+def floor_plan(
+    plan: Plan, gaussians: Mapping[str, NDArray], centres: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return page positions (N, 2) and colours (N, 3) of the opaque Gaussians below the cameras, lowest first.
+
+    Args:
+        plan: The axes of the view.
+        gaussians: Arrays by name, as from `GaussianField.to_numpy`.
+        centres: (M, 3) camera centres. Gaussians above their median height are left out.
+    """
+    position = np.asarray(gaussians["position"], dtype=np.float64)
+    opaque = np.asarray(gaussians["opacity_logit"]).ravel() > np.log(LEAST_OPACITY / (1 - LEAST_OPACITY))
+    height = position @ plan.up
+    shown = np.flatnonzero(opaque & (height <= np.median(centres @ plan.up)) & np.isfinite(position).all(axis=1))
+    shown = shown[:: max(1, -(-len(shown) // MOST_SHOWN))]
+    shown = shown[np.argsort(height[shown], kind="stable")]
+    colour = 0.5 + SH_C0 * np.asarray(gaussians["sh"], dtype=np.float64)[shown, 0]
+    return plan.on_page(position[shown]), np.clip(colour, 0.0, 1.0)
+
+
+def _unit(v: NDArray[np.float64], otherwise: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Normalise `v`, or `otherwise` if `v` is close to zero."""
+    v = v if np.linalg.norm(v) > 1e-6 else otherwise
+    return v / np.linalg.norm(v)
+
+
+Arguments = ParamSpec("Arguments")
 
 
 def _drawn(draw: Callable[Arguments, Figure]) -> Callable[Arguments, str]:

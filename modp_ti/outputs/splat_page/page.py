@@ -1,19 +1,150 @@
-"""Writes the page; see the package."""
+"""One web page with the map, a viewer and a flight along the trajectory."""
 
 from __future__ import annotations
 
 import base64
 import os
 from collections.abc import Mapping
+from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
+from fields.geometry.camera import PinholeCamera
+from fields.geometry.se3 import camera_centres, exp_se3, quaternion_from_matrix
 from modp_ti.files.atomic import replace_text
 from modp_ti.outputs.formats.sog import sog_bytes
+from modp_ti.outputs.playback.camera_paths import smoothed
+from modp_ti.outputs.playback.finished_run import FinishedRun
+from pipelines.render.spherical_harmonics import sh_rotation
 
-__all__ = ["write_splat_page", "write_streaming_page"]
+__all__ = ["Levelled", "level", "moved", "viewer_settings", "write_splat_page", "write_streaming_page"]
+
+# The scene's depth in the page [m].
+DEPTH = 3.0
+# Weight of the cameras' y axes in the direction of gravity. It decides where the x axes leave the pitch open.
+HELD = 0.01
+# Duration of the flight [s] and its keyframes per second, and the deviation of its smoothing [frames].
+SHORTEST, LONGEST = 4.0, 90.0
+KEYS_PER_SECOND = 4
+DEVIATION = 3.0
+FRAME_RATE = 30
+# Decimals of positions [m].
+DIGITS = 4
+TO_VIEWER = np.array([-1.0, -1.0, 1.0])
+# Fields of view that the viewer accepts [degrees].
+FIELDS_OF_VIEW = (10.0, 120.0)
+
+
+@dataclass(frozen=True)
+class Levelled:
+    """A similarity that makes a map upright.
+
+    Attributes:
+        R: (3, 3) rotation from the map's frame to one with y down.
+        scale: Factor on lengths.
+    """
+
+    R: NDArray[np.float64]
+    scale: float
+
+    def points(self, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Move points (..., 3) of the map."""
+        return self.scale * xyz @ self.R.T
+
+
+def level(poses: NDArray[np.float64], scene_depth: float) -> Levelled:
+    """Estimate what is upright, from cameras that were held without roll.
+
+    Down is the direction most orthogonal to the cameras' x axes. If these are nearly parallel, the mean y axis decides.
+
+    Args:
+        poses: (N, 4, 4) T_camera_world.
+        scene_depth: The scene's depth [scene units].
+    """
+    x, y = poses[:, 0, :3], poses[:, 1, :3]
+    A = x.T @ x + HELD * (len(y) * np.eye(3) - y.T @ y)
+    down = np.linalg.eigh(A)[1][:, 0]
+    down = down if down @ y.sum(axis=0) >= 0 else -down
+    return Levelled(_turning(down, np.array([0.0, 1.0, 0.0])), DEPTH / scene_depth)
+
+
+def moved(state: Mapping[str, NDArray], R: NDArray[np.float64], scale: float) -> dict[str, NDArray]:
+    """Rotate Gaussians by R (3, 3) and scale them, both around the origin."""
+    w, x, y, z = quaternion_from_matrix(R)
+    # Product of R's quaternion with each Gaussian's, as a matrix.
+    product = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
+    M = sh_rotation(round(state["sh"].shape[1] ** 0.5) - 1, R)
+    return {
+        "position": scale * state["position"].astype(np.float64) @ R.T,
+        "log_scale": state["log_scale"].astype(np.float64) + np.log(scale),
+        "quaternion": state["quaternion"].astype(np.float64) @ product.T,
+        "opacity_logit": state["opacity_logit"],
+        "sh": np.einsum("kj,njc->nkc", M, state["sh"].astype(np.float64)),
+    }
+
+
+def viewer_settings(run: FinishedRun, levelled: Levelled) -> dict[str, Any]:
+    """Return the settings of SuperSplat's viewer, version 2: the start view, and a flight along the trajectory.
+
+    The flight takes as long as the recording. It swings back and forth, since the ends of a path are rarely near.
+    """
+    span = float(np.ptp(run.timestamps))
+    duration = round(float(np.clip(span, SHORTEST, LONGEST)), DIGITS)
+    count = round(duration * KEYS_PER_SECOND) + 1
+    poses = smoothed(run.poses[run.way], count, DEVIATION)
+    eyes = camera_centres(poses)
+    targets = eyes + run.record.scene_depth * poses[:, 2, :3]
+    position, target = ((TO_VIEWER * levelled.points(points)).round(DIGITS) for points in (eyes, targets))
+    fov = _longer_side(run.cameras[run.record.keyframes[0]])
+    start = {"position": position[0].tolist(), "target": target[0].tolist(), "fov": fov}
+    track = {
+        "name": "trajectory",
+        "duration": duration,
+        "frameRate": FRAME_RATE,
+        "loopMode": "pingpong",
+        "interpolation": "spline",
+        "smoothness": 1,
+        "keyframes": {
+            "times": np.linspace(0.0, duration * FRAME_RATE, count).round(DIGITS).tolist(),
+            "values": {"position": position.ravel().tolist(), "target": target.ravel().tolist(), "fov": [fov] * count},
+        },
+    }
+    return {
+        "version": 2,
+        "tonemapping": "none",
+        "highPrecisionRendering": False,
+        "background": {"color": [0, 0, 0]},
+        "postEffectSettings": {
+            "sharpness": {"enabled": False, "amount": 0},
+            "bloom": {"enabled": False, "intensity": 1, "blurLevel": 2},
+            "grading": {"enabled": False, "brightness": 1, "contrast": 1, "saturation": 1, "tint": [1, 1, 1]},
+            "vignette": {"enabled": False, "intensity": 0.5, "inner": 0.3, "outer": 0.75, "curvature": 1},
+            "fringing": {"enabled": False, "intensity": 0.5},
+        },
+        "animTracks": [track],
+        "cameras": [{"initial": start}],
+        "annotations": [],
+        "startMode": "animTrack",
+    }
+
+
+def _longer_side(camera: PinholeCamera) -> float:
+    """Return the field of view [degrees] along the picture's longer side, which the viewer gives the window's."""
+    ratio = max(camera.width / camera.fx, camera.height / camera.fy)
+    return round(float(np.clip(np.degrees(2 * np.arctan(ratio / 2)), *FIELDS_OF_VIEW)), DIGITS)
+
+
+def _turning(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the smallest rotation (3, 3) that takes the unit vector a to the unit vector b."""
+    axis = np.cross(a, b)
+    sine, cosine = float(np.linalg.norm(axis)), float(a @ b)
+    if sine < 1e-9:
+        # The same direction, or the opposite one: half a turn around the x axis, for b is y.
+        return np.eye(3) if cosine > 0 else np.diag([1.0, -1.0, -1.0])
+    return exp_se3(np.append(np.zeros(3), axis / sine * np.arctan2(sine, cosine)))[:3, :3]
 
 
 def write_splat_page(

@@ -22,9 +22,8 @@ from modp_ti.outputs.formats.run_files import read_exposures
 from modp_ti.outputs.playback.finished_run import FinishedRun
 from modp_ti.outputs.playback.map_renderer import MapRenderer, start_device
 from modp_ti.outputs.viewer.handover import BrowserCamera, Latest
-from modp_ti.outputs.viewer.modes import MODES, SPLATS, Photograph, painter, pinhole_of
+from modp_ti.outputs.viewer.modes import MODES, SPLATS, Photograph, painter, pinhole_of, splats_of
 from modp_ti.outputs.viewer.page import Page, ShownFrame
-from modp_ti.outputs.viewer.splats import splats_of
 from pipelines.whole.hierarchy import Hierarchy
 
 __all__ = ["FinishedViewer"]

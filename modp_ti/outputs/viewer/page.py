@@ -15,8 +15,7 @@ from fields.geometry.se3 import camera_centres, inverse_se3, quaternion_from_mat
 from modp_ti.files.errors import InputError
 from modp_ti.outputs.viewer.browser import FRAME, KEYFRAMES, POINTS, SPLATS_NODE, Browser
 from modp_ti.outputs.viewer.handover import Gate, Requests
-from modp_ti.outputs.viewer.modes import MODES, SPLATS
-from modp_ti.outputs.viewer.splats import Splats
+from modp_ti.outputs.viewer.modes import MODES, SPLATS, Splats
 
 if TYPE_CHECKING:
     import viser

@@ -314,7 +314,7 @@ def failure(*arguments: str | Path) -> str:
         (["--format", "html", "--spz-version", "3"], "--spz-version: "),
         (["--format", "spz", "-o", "{out}/splats.ply/here.spz"], "cannot be made: "),
         (["--format", "points", "-o", "{out}/splats.ply"], "is the map itself"),
-        (["--format", "video", "-o", "film.avi"], "in .mp4 or .webm"),
+        (["--format", "video", "-o", "film.avi"], ".mp4, .webm"),
     ],
 )
 def test_an_export_that_cannot_be_is_refused_in_one_line(out: Path, arguments: list[str], part: str) -> None:

@@ -17,7 +17,7 @@ from fields.runtime.backend import initialise
 from modp_ti.config.settings import ViewSettings
 from modp_ti.engine.live_viewer import PATIENCE, LiveViewer
 from modp_ti.engine.mapper import Mapper
-from modp_ti.outputs.live_status import LiveStatus
+from modp_ti.outputs.progress import LiveStatus
 from modp_ti.outputs.viewer.handover import BrowserCamera
 from modp_ti.outputs.viewer.modes import LEAST_SIDE, MODES
 from pipelines.pipeline import FrameReport

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from modp_ti.outputs.detail import explained_detail
+from modp_ti.outputs.evaluation import explained_detail
 
 WHOLE = np.ones((40, 60), dtype=bool)
 

@@ -6,8 +6,7 @@ import pytest
 from rich.console import Console
 
 from modp_ti.outputs import progress
-from modp_ti.outputs.live_status import LiveStatus
-from modp_ti.outputs.progress import ProgressLine, StageProgress
+from modp_ti.outputs.progress import LiveStatus, ProgressLine, StageProgress
 from pipelines.pipeline import FrameReport
 
 

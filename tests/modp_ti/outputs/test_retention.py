@@ -3,8 +3,7 @@ from __future__ import annotations
 import pytest
 
 from modp_ti.outputs.evaluation import FrameScore
-from modp_ti.outputs.report.record import FrameNote
-from modp_ti.outputs.retention import WINDOW, retention
+from modp_ti.outputs.report.record import WINDOW, FrameNote, retention
 
 
 def notes(mapped: list[float | None]) -> list[FrameNote]:

@@ -6,8 +6,7 @@ from dataclasses import replace
 import pytest
 
 from fields.runtime.backend import initialise
-from modp_ti.outputs.evaluation import FrameScore, MapVersion, evaluate, score_frame, summary
-from modp_ti.outputs.still_scores import StillScore
+from modp_ti.outputs.evaluation import FrameScore, MapVersion, StillScore, evaluate, score_frame, summary
 from pipelines.online import OnlineMapper
 from pipelines.settings import MappingSettings
 from tests.pipelines.walked_wall import FRAMES, SETTINGS, still, walked, walker

@@ -20,10 +20,8 @@ from modp_ti.config.tracker_settings import TransformsSettings
 from modp_ti.engine.results import metrics_of
 from modp_ti.inputs.delivered_frames import DeliveredFrames
 from modp_ti.outputs.evaluation import FrameScore, MapVersion
-from modp_ti.outputs.report.page import ReportedRun
-from modp_ti.outputs.report.pictures import Album
-from modp_ti.outputs.report.record import RunRecord, StepNote
-from modp_ti.outputs.retention import retention
+from modp_ti.outputs.report.page import Album, ReportedRun
+from modp_ti.outputs.report.record import RunRecord, StepNote, retention
 from pipelines.pipeline import FrameReport
 
 

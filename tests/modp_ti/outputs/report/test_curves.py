@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from modp_ti.outputs.report.curves import binned, frame_rate, shifts_and_turns
+from modp_ti.outputs.report.plots import binned, frame_rate, shifts_and_turns
 from modp_ti.outputs.report.record import FrameNote
 
 

@@ -10,8 +10,8 @@ import pytest
 
 from fields.runtime.engine import engine
 from modp_ti.engine.results import Results
-from modp_ti.outputs.report.curves import frame_rate
 from modp_ti.outputs.report.page import ReportedRun, write_report
+from modp_ti.outputs.report.plots import frame_rate
 from tests.modp_ti.outputs.report.made_up_run import Page, black_frame, delivered, made_up_run, picture
 
 pytestmark = pytest.mark.slow

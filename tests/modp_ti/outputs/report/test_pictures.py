@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from modp_ti.outputs.evaluation import FrameScore
-from modp_ti.outputs.report.pictures import FULL_SCALE, Album, data_uri, error_colours, error_map, picked
+from modp_ti.outputs.report.page import FULL_SCALE, Album, data_uri, error_colours, error_map, picked
 
 
 def score(index: int, psnr: float, held_out: bool = True) -> FrameScore:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from modp_ti.outputs.report.plan import floor_plan, plan_of
+from modp_ti.outputs.report.plots import floor_plan, plan_of
 from tests.modp_ti.outputs.report.made_up_run import cameras
 
 

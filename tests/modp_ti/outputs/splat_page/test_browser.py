@@ -23,7 +23,7 @@ from modp_ti.outputs.playback.export_map import ExportOptions, export_map
 from modp_ti.outputs.playback.finished_run import FinishedRun, open_run
 from modp_ti.outputs.playback.map_renderer import MapRenderer
 from modp_ti.outputs.progress import ProgressLine
-from modp_ti.outputs.splat_page.flight import TO_VIEWER, level, moved, viewer_settings
+from modp_ti.outputs.splat_page.page import TO_VIEWER, level, moved, viewer_settings
 from pipelines.whole.hierarchy import LEVELS
 from tests.patience import PATIENCE
 

@@ -14,7 +14,7 @@ from fields.geometry.camera import PinholeCamera
 from modp_ti.outputs.formats.run_files import FramesRecord
 from modp_ti.outputs.playback.camera_paths import looking_at
 from modp_ti.outputs.playback.finished_run import FinishedRun
-from modp_ti.outputs.splat_page.flight import DEPTH, level, moved, viewer_settings
+from modp_ti.outputs.splat_page.page import DEPTH, level, moved, viewer_settings
 from tests.modp_ti.outputs.formats.test_splats import splats
 from tests.pipelines.reference import sh_basis
 

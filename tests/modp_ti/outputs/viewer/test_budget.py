@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from modp_ti.outputs.viewer.budget import CostLimit, ThreadClock
+from modp_ti.outputs.viewer.handover import CostLimit, ThreadClock
 
 
 class Clock:

@@ -26,8 +26,8 @@ from zstandard import ZstdDecompressor
 from fields.geometry.camera import PinholeCamera
 from modp_ti.files.errors import InputError
 from modp_ti.outputs.viewer.handover import Gate
+from modp_ti.outputs.viewer.modes import Splats
 from modp_ti.outputs.viewer.page import Page
-from modp_ti.outputs.viewer.splats import Splats
 from tests.patience import PATIENCE
 
 CAMERA = PinholeCamera(100.0, 100.0, 60.0, 40.0, 120, 80)

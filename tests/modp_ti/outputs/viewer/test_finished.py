@@ -22,8 +22,7 @@ from modp_ti.outputs.playback.map_renderer import MapRenderer
 from modp_ti.outputs.playback.splat_file import open_splats
 from modp_ti.outputs.viewer.finished import FinishedViewer
 from modp_ti.outputs.viewer.handover import BrowserCamera
-from modp_ti.outputs.viewer.modes import MODES, UNSEEN
-from modp_ti.outputs.viewer.splats import Splats
+from modp_ti.outputs.viewer.modes import MODES, UNSEEN, Splats
 
 pytestmark = pytest.mark.slow
 

@@ -14,8 +14,8 @@ import pytest
 
 from fields.geometry.camera import PinholeCamera
 from modp_ti.files.errors import InputError
+from modp_ti.outputs.viewer.modes import Splats
 from modp_ti.outputs.viewer.page import DEPTH_ON_PAGE, KEYFRAME_SIZE, Page, ShownFrame, frustum_lines
-from modp_ti.outputs.viewer.splats import Splats
 from tests.patience import PATIENCE
 
 CAMERA = PinholeCamera(100.0, 100.0, 60.0, 40.0, 120, 80)

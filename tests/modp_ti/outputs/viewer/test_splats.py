@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from modp_ti.outputs.viewer.splats import splats_of
+from modp_ti.outputs.viewer.modes import splats_of
 
 
 def some(count: int) -> dict[str, np.ndarray]:
