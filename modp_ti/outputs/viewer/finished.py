@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,14 +12,12 @@ from numpy.typing import NDArray
 from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import inverse_se3
 from modp_ti.config.settings import ViewSettings
-from modp_ti.files import read_bytes
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.sources.image_header import why_undecodable
-from modp_ti.inputs.sources.image_pixels import decoded
 from modp_ti.inputs.trackers.colmap_files import read_colmap_model
 from modp_ti.outputs.formats.run_files import read_exposures
 from modp_ti.outputs.playback.finished_run import FinishedRun
-from modp_ti.outputs.playback.map_renderer import MapRenderer, start_device
+from modp_ti.outputs.playback.map_renderer import MapRenderer, eight_bits, start_device
+from modp_ti.outputs.playback.run_pictures import kept_images, pictures
 from modp_ti.outputs.viewer.handover import BrowserCamera, Latest
 from modp_ti.outputs.viewer.modes import MODES, SPLATS, Photograph, painter, pinhole_of, splats_of
 from modp_ti.outputs.viewer.page import Page, ShownFrame
@@ -56,11 +53,10 @@ class FinishedViewer:
         self._max_splats = settings.max_splats
         self._chosen: Latest[dict[int, int]] = Latest(lambda newer, waiting: waiting | newer)
         gaussians, points = run.gaussians, _tracked_points(run)
-        self._kept = (run.folder / "colmap" / "images").is_dir()
+        self._kept = kept_images(run) is not None
         self._exposures = read_exposures(run.folder / "exposure.json") if self._kept else {}
         modes = MODES if self._kept else tuple(mode for mode in MODES if mode != "error")
-        choose = lambda client, index: self._chosen.put({client: index})  # noqa: E731
-        self.page = Page(settings.host, settings.port, None, modes, choose, len(run))
+        self.page = Page(settings.host, settings.port, None, modes, self.choose, len(run))
         self.url = self.page.url
         start_device(device)
         largest = (max(*(getattr(c, side) for c in run.cameras), 0) for side in ("width", "height"))
@@ -83,6 +79,10 @@ class FinishedViewer:
     def close(self) -> None:
         """Stop serving the page."""
         self.page.close()
+
+    def choose(self, client: int, index: int) -> None:
+        """Show a frame to a browser, which `serve` does."""
+        self._chosen.put({client: index})
 
     def serve(self, done: Callable[[], bool] = lambda: False) -> None:
         """Render what browsers request, until `done` returns true."""
@@ -139,26 +139,14 @@ class FinishedViewer:
 
     def _photograph(self, index: int) -> Photograph:
         """Return the kept image of a frame. Raises InputError if it is missing or damaged."""
-        run = self.run
-        path = run.folder / "colmap" / "images" / run.names[index]
-        image = _kept_picture(path)
-        camera = run.cameras[index]
-        if image is None or image.shape[:2] != (camera.height, camera.width):
-            raise InputError(f"{path}: the run's image is missing or damaged")
-        rgba = np.dstack([image, np.full(image.shape[:2], 255, dtype=np.uint8)])
-        mask = _kept_picture(run.folder / "colmap" / "masks" / f"{run.names[index]}.png")
-        if mask is not None and mask.shape == image.shape:
-            rgba[mask.max(axis=2) == 0] = 0
+        run, camera = self.run, self.run.cameras[index]
+        picture = next(pictures(run, wanted=[index]))
+        if picture.image.shape[:2] != (camera.height, camera.width):
+            raise InputError(f"{run.folder}: the image of {run.names[index]} has another size than its camera")
+        rgba = np.dstack([eight_bits(picture.image), np.full(picture.image.shape[:2], 255, dtype=np.uint8)])
+        if picture.mask is not None:
+            rgba[~picture.mask] = 0
         return Photograph(rgba, camera, run.poses[index], self._exposures.get(index))
-
-
-def _kept_picture(path: Path) -> NDArray[np.uint8] | None:
-    """Read a picture (H, W, 3) RGB that the run kept. None if it is missing or damaged."""
-    try:
-        data = read_bytes(path)
-    except OSError:
-        return None
-    return decoded(data) if why_undecodable(data) is None else None
 
 
 def _tracked_points(run: FinishedRun) -> NDArray[np.float64]:

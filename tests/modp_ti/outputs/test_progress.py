@@ -45,61 +45,33 @@ def test_a_terminal_has_one_line_that_moves(monkeypatch: pytest.MonkeyPatch) -> 
     assert "mapping 1/3" not in written(terminal=True)
 
 
-def test_the_time_left_includes_that_of_later_stages(monkeypatch: pytest.MonkeyPatch) -> None:
-    """30 of 90 frames at 2 s each are done: 2 minutes for the others, and 3 minutes for what follows."""
+@pytest.mark.parametrize(
+    ("totals", "later", "place", "left"),
+    [
+        ([90] * 30, lambda _: 180.0, "mapping 30/90", "5 min left"),  # 2 minutes of frames, and 3 of what follows
+        ([100] * 20 + [60] * 10, lambda _: 0.0, "mapping 20/100", "3 min left"),
+        ([100] * 20 + [60] * 10, lambda _: 0.0, "mapping 30/60", "1 min left"),  # frames that the tracker skips
+        ([60] * 30, lambda frame: 30 * frame, "mapping 30/60", "2 min left"),  # what follows, by the pace
+        ([100] * 20, lambda _: None, "mapping 20/100", None),  # that of later stages is unknown
+        ([100] * 4, lambda _: 0.0, "mapping 4/100", None),  # no estimate in the first ten seconds
+    ],
+)
+def test_the_time_left_includes_that_of_later_stages(
+    monkeypatch: pytest.MonkeyPatch, totals: list[int], later, place: str, left: str | None
+) -> None:
+    """Frames of 2 s each, after each of which `totals` says how many are expected."""
     now = [0.0]
     monkeypatch.setattr(progress, "LOG_EVERY", 0.0)
     monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
     console = Console(file=io.StringIO(), width=100)
     line = ProgressLine(console)
-    line.start("mapping", 90, later=lambda _: 180.0)
-    for index in range(30):
-        now[0] += 2.0
-        line.frame(FrameReport(index, True, index + 1, 1200, 20.5))
-    line.stop()
-    text = console.file.getvalue()
-    assert "mapping 30/90" in text and text.split("mapping 30/90")[1].splitlines()[0].endswith("5 min left")
-    assert "left" not in text.split("mapping 5/90")[0], "no estimate in the first ten seconds"
-
-
-def log_of(monkeypatch: pytest.MonkeyPatch, totals: list[int], later: float | None) -> str:
-    """The log of frames of 2 s each, after each of which that many frames are expected."""
-    now = [0.0]
-    monkeypatch.setattr(progress, "LOG_EVERY", 0.0)
-    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
-    console = Console(file=io.StringIO(), width=100)
-    line = ProgressLine(console)
-    line.start("mapping", totals[0], later=lambda _: later)
+    line.start("mapping", totals[0], later=later)
     for index, frames in enumerate(totals):
         now[0] += 2.0
         line.frame(FrameReport(index, True, index + 1, 1200, 20.5), frames)
     line.stop()
-    return console.file.getvalue()
-
-
-def test_frames_that_the_tracker_skips_are_no_longer_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    log = log_of(monkeypatch, [100] * 20 + [60] * 10, later=0.0)
-    for place, left in (("mapping 20/100", "3 min left"), ("mapping 30/60", "1 min left")):
-        assert log.split(place)[1].splitlines()[0].endswith(left)
-
-
-def test_no_time_is_shown_while_that_of_later_stages_is_unknown(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert "left" not in log_of(monkeypatch, [100] * 20, later=None)
-
-
-def test_what_follows_may_be_told_from_the_pace(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Steps of 3 s, and afterwards as much work as 20 of them."""
-    now = [0.0]
-    monkeypatch.setattr(progress, "LOG_EVERY", 0.0)
-    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
-    console = Console(file=io.StringIO(), width=100)
-    line = ProgressLine(console)
-    line.start("refining", 40, later=lambda step: 20 * step)
-    for step in range(1, 21):
-        now[0] += 3.0
-        line.step(step, 25.0)
-    line.stop()
-    assert console.file.getvalue().split("refining 20/40")[1].splitlines()[0].endswith("2 min left")
+    said = console.file.getvalue().split(place)[1].splitlines()[0]
+    assert said.endswith(left) if left else "left" not in said
 
 
 def test_a_realtime_run_shows_how_it_keeps_pace(monkeypatch: pytest.MonkeyPatch) -> None:

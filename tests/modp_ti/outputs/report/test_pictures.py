@@ -10,30 +10,11 @@ import numpy as np
 import pytest
 
 from modp_ti.outputs.evaluation import FrameScore
-from modp_ti.outputs.report.page import FULL_SCALE, Album, data_uri, error_colours, error_map, picked
+from modp_ti.outputs.report.page import FULL_SCALE, Album, data_uri, picked
 
 
 def score(index: int, psnr: float, held_out: bool = True) -> FrameScore:
     return FrameScore(index, f"f{index}", held_out, "online", psnr, 0.9, None)
-
-
-def test_the_error_map_is_the_mean_difference_of_the_three_colours() -> None:
-    rng = np.random.default_rng(0)
-    image, render = rng.integers(0, 256, (2, 5, 7, 3), dtype=np.uint8)
-    error = error_map(image, render)
-    assert error.shape == (5, 7)
-    for row in range(5):
-        for column in range(7):
-            a, b = image[row, column].tolist(), render[row, column].tolist()
-            expected = sum(abs(x - y) for x, y in zip(a, b, strict=True)) / 3 / 255
-            assert error[row, column] == pytest.approx(expected, abs=1e-6)
-    assert error_map(np.zeros((1, 1, 3), np.uint8), np.full((1, 1, 3), 255, np.uint8))[0, 0] == 1.0
-
-
-def test_the_colours_of_errors_are_inferno_up_to_the_full_scale() -> None:
-    error = np.array([[0.0, FULL_SCALE / 2, FULL_SCALE, 1.0]], np.float32)
-    expected = matplotlib.colormaps["inferno"]([0.0, 0.5, 1.0, 1.0])[:, :3] * 255
-    np.testing.assert_allclose(error_colours(error)[0], expected, atol=4)
 
 
 def test_a_picture_is_a_jpeg_of_limited_size_with_its_colours() -> None:
@@ -64,11 +45,6 @@ def test_of_few_frames_each_is_shown_once(count: int) -> None:
     assert len({s.index for s, _ in chosen}) == len(chosen) == min(count, 7)
     if count > 2:
         assert chosen[0][1] == "worst" and chosen[-1] == (score(count - 1, 19.0 + count), "best")
-
-
-def test_frames_with_the_same_score_and_without_a_finite_one_are_in_order() -> None:
-    chosen = picked([score(2, float("inf")), score(1, 30.0), score(0, 30.0)])
-    assert [s.index for s, _ in chosen] == [0, 1, 2]
 
 
 def test_held_out_frames_are_read_from_the_written_pairs(tmp_path) -> None:

@@ -1,8 +1,11 @@
-"""What is noted of a run: when each frame was done, and what it did."""
+"""What is noted of a run: when each frame was done, what it did, and how the map kept its quality."""
 
 from __future__ import annotations
 
-from modp_ti.outputs.report.record import FrameNote, RunRecord
+import pytest
+
+from modp_ti.outputs.evaluation import FrameScore
+from modp_ti.outputs.report.record import WINDOW, FrameNote, RunRecord, retention
 from pipelines.pipeline import FrameReport
 
 
@@ -30,3 +33,31 @@ def test_a_realtime_run_notes_lag_waiting_frames_and_steps() -> None:
         FrameNote(0, False, True, 1.0, 250, 18.5, lag=0.25, waiting=2, steps=7),
         FrameNote(1, True, False, 2.0, 250, None, lag=0.125, waiting=1),
     ]
+
+
+def notes(mapped: list[float | None]) -> list[FrameNote]:
+    return [FrameNote(i, False, psnr is not None, float(i), 10, psnr, psnr) for i, psnr in enumerate(mapped)]
+
+
+def scores(psnr: list[float], stage: str = "online") -> list[FrameScore]:
+    return [FrameScore(i, f"f{i}", False, stage, value, 0.9, None) for i, value in enumerate(psnr)]
+
+
+def test_the_change_is_that_of_keyframes_in_every_version() -> None:
+    of = retention(notes([20.0, None, 22.0]), scores([21.0, 0.0, 21.0]) + scores([24.0, 0.0, 25.0], "refined"))
+    assert of == {"online": {"mean": 0.0, "worst": 0.0}, "refined": {"mean": 3.5, "worst": 3.5}}
+
+
+def test_the_worst_is_the_mean_of_a_stretch_and_not_of_a_keyframe() -> None:
+    count = 3 * WINDOW
+    final = [30.0] * count
+    for i in range(WINDOW + 5, 2 * WINDOW):  # three quarters of a window lose 2 dB
+        final[i] = 28.0
+    of = retention(notes([30.0] * count), scores(final))
+    assert of is not None
+    assert of["online"]["worst"] == pytest.approx(-2.0 * (WINDOW - 5) / WINDOW)
+    assert of["online"]["mean"] == pytest.approx(-2.0 * (WINDOW - 5) / count)
+
+
+def test_without_mapped_keyframes_there_is_none() -> None:
+    assert retention(notes([None, None]), scores([20.0, 21.0], "offline")) is None

@@ -35,8 +35,13 @@ PROTOCOL = f"viser-v{viser.__version__}"
 
 
 @pytest.fixture
-def page() -> Iterator[Page]:
-    page = Page("127.0.0.1", 0, Gate(), choose=lambda client, frame: None, frames=5)
+def gate() -> Gate:
+    return Gate()
+
+
+@pytest.fixture
+def page(gate: Gate) -> Iterator[Page]:
+    page = Page("127.0.0.1", 0, gate, choose=lambda client, frame: None, frames=5)
     yield page
     page.close()
 
@@ -269,9 +274,10 @@ def test_no_message_and_no_transfer_fills_the_memory(page: Page):
 
 def test_a_fault_of_one_browser_ends_its_session_alone(page: Page):
     browser, _ = entered(page)
-    (first,) = page._browsers
+    first = page.requests.next()
+    assert first is not None
     other, _ = entered(page)
-    page.attempt(first, lambda: [][1])
+    page.attempt(first.client, lambda: [][1])
     with pytest.raises(ConnectionClosed):
         while True:
             browser.recv(timeout=PATIENCE)
@@ -339,12 +345,11 @@ def test_the_first_view_is_that_of_the_camera(page: Page):
     assert found["SetCameraFovMessage"]["fov"] == pytest.approx(2 * np.arctan(0.4))
 
 
-def test_the_browser_that_paused_is_known_until_it_leaves(page: Page):
+def test_the_browser_that_paused_is_known_until_it_leaves(page: Page, gate: Gate):
     browser, controls = entered(page)
     other, _ = entered(page)
     browser.send(put(controls["Pause"], True))
-    gate, end = page._gate, time.monotonic() + PATIENCE
-    assert gate is not None
+    end = time.monotonic() + PATIENCE
     while not gate.paused:
         assert time.monotonic() < end
         time.sleep(0.01)

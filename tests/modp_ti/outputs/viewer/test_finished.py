@@ -138,7 +138,7 @@ def test_the_chosen_frame_is_shown_with_its_picture(run: FinishedRun):
     viewer.page.show_frame = lambda frame, client: shown.append((frame, client))
     try:
         for client, index in ((5, 0), (6, 2), (5, 1)):
-            viewer._chosen.put({client: index})
+            viewer.choose(client, index)
         viewer.serve(lambda: len(shown) > 0)
         assert sorted(client for _, client in shown) == [5, 6]
         for frame, client in shown:
@@ -156,7 +156,7 @@ def test_an_image_that_is_gone_ends_nothing(run: FinishedRun):
     viewer.page.show_picture = lambda client, picture: got.append(picture)
     (run.folder / "colmap" / "images" / "c.png").unlink()
     try:
-        viewer._chosen.put({5: 2})
+        viewer.choose(5, 2)
         for mode in ("error", "colour"):
             looks(viewer, run.poses[2], 96, 64, mode)
             turns = iter(range(3))
