@@ -42,9 +42,8 @@ from modp_ti.inputs.scene_paths import refuse_output_in_input
 from modp_ti.inputs.trackers import Tracker, open_tracker
 from modp_ti.outputs.evaluation import FrameScore, MapVersion, evaluate, trajectory_errors
 from modp_ti.outputs.lpips import open_lpips
-from modp_ti.outputs.progress import ProgressLine, StageProgress
+from modp_ti.outputs.progress import ProgressLine, StageProgress, TimeAfterMapping
 from modp_ti.outputs.report.record import RunRecord, StepNote, mapped_psnr, retention
-from modp_ti.outputs.time_left import TimeAfterMapping
 from pipelines.companions.block_files import BlockError
 from pipelines.companions.pace import CompletePace
 from pipelines.settings import RefineSettings
@@ -304,7 +303,7 @@ class _Session:
         """Refine the map for the settings' steps or time. Raises RunStopped between two steps."""
         done, steps = self.checkpointer.refined, settings.steps if settings.seconds is None else None
         scores = self.after_mapping.scores(len(self.mapper.frames)) / settings.views  # in steps
-        self.line.start("refining", steps, done, lambda step: step * scores, prepares=True)
+        self.line.start("refining", steps, done, lambda step: step * scores)
         schedule = self.conductor.schedule(settings)
         try:
             self.mapper.refine(settings.steps, settings, partial(self._refined, steps), done, schedule)

@@ -6,7 +6,7 @@ from typing import cast
 import pytest
 
 from modp_ti.config.settings import SceneConfig
-from modp_ti.outputs.time_left import FULL_SIZE, RENDERED, SCORED, TimeAfterMapping, TimeLeft, duration
+from modp_ti.outputs.progress import FULL_SIZE, RENDERED, SCORED, TimeAfterMapping, TimeLeft, duration
 from pipelines.pipeline import Pipeline
 
 
@@ -44,7 +44,7 @@ def test_the_pace_is_that_of_the_last_third() -> None:
 
 def test_preparations_are_not_extrapolated() -> None:
     clock = Clock()
-    left = TimeLeft(1000, clock=clock, prepares=True)
+    left = TimeLeft(1000, clock=clock)
     after(left, clock, [60.0])
     assert left.seconds() is None
     after(left, clock, [0.2] * 60, done=1)
