@@ -22,7 +22,7 @@ from modp_ti.files.terminal import CleanConsole
 from modp_ti.many.batch import LOGS, run_batch
 from modp_ti.many.pool import LocalPool
 from modp_ti.many.scenes import Scene, for_a_task
-from modp_ti.outputs.formats.scores_csv import read_scores
+from modp_ti.outputs.formats.run_files import read_scores
 
 __all__ = [
     "Figures",

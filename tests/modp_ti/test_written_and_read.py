@@ -1,4 +1,5 @@
 """What our writers write, whatever it is, our readers give back."""
+# pyright: reportArgumentType=false, reportCallIssue=false
 
 from __future__ import annotations
 

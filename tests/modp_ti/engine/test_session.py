@@ -1,4 +1,6 @@
 """Whole runs of a small room, short, as a user starts them: in processes of their own."""
+# pyright: reportArgumentType=false, reportCallIssue=false
+# pyright: reportOptionalCall=false, reportOptionalMemberAccess=false, reportOptionalSubscript=false
 
 from __future__ import annotations
 

@@ -1,3 +1,4 @@
+# pyright: reportPossiblyUnboundVariable=false
 from __future__ import annotations
 
 from types import SimpleNamespace

@@ -2,6 +2,7 @@
 
 `tests/modp_ti/test_written_and_read.py` has the round trips of frames, scores and trajectories.
 """
+# pyright: reportCallIssue=false
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
 """The pictures and frames of finished runs, read again in their order."""
+# pyright: reportPossiblyUnboundVariable=false
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
 """Frames, renders and error maps, against what is computed pixel by pixel."""
+# pyright: reportArgumentType=false, reportOptionalMemberAccess=false, reportOptionalSubscript=false
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
 """The page's frame: what is upright, the moved map, and the flight."""
+# pyright: reportArgumentType=false, reportCallIssue=false
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
 """Who comes in at the viewer's port, and what a browser can do to the rest: nothing."""
+# pyright: reportArgumentType=false, reportOperatorIssue=false
 
 from __future__ import annotations
 
