@@ -1,4 +1,4 @@
-"""JSON reader that checks the nesting depth before it builds any object."""
+"""JSON reader whose errors name the file and the line."""
 
 from __future__ import annotations
 
@@ -12,9 +12,6 @@ from modp_ti.files.reading import read_text, readable
 
 __all__ = ["parse_json", "read_json"]
 
-MAX_DEPTH = 64
-# Brackets, quotes and escaped characters. Brackets within strings do not count.
-TOKEN = re.compile(r'\\.|["\[{\]}]', re.DOTALL)
 # An escaped UTF-16 surrogate. A valid character consists of a pair of them.
 HALF_CHARACTER = re.compile(r"\\u[dD][89a-fA-F]")
 # Integers with more characters than this become floats.
@@ -48,9 +45,8 @@ def parse_json(text: str, name: str, line: int = 1) -> Any:
         line: Line of the file at which the text starts, for the error message.
 
     Raises:
-        InputError: With the line, if the text is not valid JSON or is nested deeper than `MAX_DEPTH`.
+        InputError: With the line, if the text is not valid JSON or is nested deeper than Python follows.
     """
-    _require_shallow(text, name, line)
     try:
         data = json.loads(text, parse_int=lambda digits: (int if len(digits) <= DIGITS else float)(digits))
         if HALF_CHARACTER.search(text):
@@ -60,20 +56,10 @@ def parse_json(text: str, name: str, line: int = 1) -> Any:
         raise _invalid(name, line + error.lineno - 1, error.msg) from None
     except UnicodeEncodeError:
         raise _invalid(name, line, "it holds half a character (a surrogate)") from None
-    except (ValueError, RecursionError) as error:
+    except RecursionError:
+        raise _invalid(name, line, "it is nested too deep") from None
+    except ValueError as error:
         raise _invalid(name, line, str(error)) from None
-
-
-def _require_shallow(text: str, name: str, first: int) -> None:
-    depth, in_string = 0, False
-    for token in TOKEN.finditer(text):
-        kind = token[0]
-        if kind == '"':
-            in_string = not in_string
-        elif not in_string and not kind.startswith("\\"):
-            depth += 1 if kind in "[{" else -1
-            if depth > MAX_DEPTH:
-                raise _invalid(name, first + text.count("\n", 0, token.start()), f"nested deeper than {MAX_DEPTH}")
 
 
 def _invalid(name: str, line: int, reason: str) -> InputError:

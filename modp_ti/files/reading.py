@@ -15,6 +15,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import psutil
+
 from modp_ti.files.errors import InputError
 
 __all__ = [
@@ -42,8 +44,6 @@ LARGEST = 1e30
 
 # Share of the available memory that one file may take.
 SHARE = 0.25
-# Bytes of memory assumed where the system does not report its memory.
-ASSUMED = 4 << 30
 CGROUP_LIMITS = (
     ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
     ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory/memory.usage_in_bytes"),
@@ -183,17 +183,9 @@ def limited_lines(text: io.TextIOBase, longest: int = MAX_LINE) -> Iterator[str]
 
 def available_memory() -> int:
     """Approximate bytes that this process can still allocate: the least that machine, container and rlimit allow."""
-    return max(0, min(_of_machine(), *(_of_container(*files) for files in CGROUP_LIMITS), _of_process()))
-
-
-def _of_machine() -> int:
-    try:
-        for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
-            if line.startswith("MemAvailable:"):
-                return int(line.split()[1]) << 10
-        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (OSError, ValueError, AttributeError, IndexError):
-        return ASSUMED
+    return max(
+        0, min(psutil.virtual_memory().available, *(_of_container(*files) for files in CGROUP_LIMITS), _of_process())
+    )
 
 
 def _of_container(limit: str, used: str) -> int:
@@ -210,7 +202,6 @@ def _of_process() -> int:
         soft, _ = resource.getrlimit(resource.RLIMIT_AS)
         if soft == resource.RLIM_INFINITY:
             return 1 << 62
-        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
-        return soft - pages * resource.getpagesize()
-    except (ImportError, OSError, ValueError):
+        return soft - psutil.Process().memory_info().vms
+    except (ImportError, OSError, ValueError):  # Windows has no such limit
         return 1 << 62

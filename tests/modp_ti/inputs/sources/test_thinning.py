@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from modp_ti.inputs.sources import backlog as backlogs
-from modp_ti.inputs.sources.backlog import Backlog
-from modp_ti.inputs.sources.thinning import Thinning
+from modp_ti.inputs.sources.backlog import Backlog, Thinning
 
 
 def played(
@@ -218,7 +217,7 @@ def test_too_many_waiting_frames_are_halved_evenly(monkeypatch):
     for i in range(20):
         backlog.add(0.1 * i, i)
     assert len(backlog) <= 8
-    left = [backlog._waiting[i][1] for i in range(len(backlog))]
+    left = [item for _, item in backlog._waiting if item is not None]
     assert sorted(left + dropped) == list(range(20))
     assert left[-1] == 19
     assert max(np.diff(left)) <= 5
