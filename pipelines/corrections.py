@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,15 +16,16 @@ from fields.geometry.se3 import interpolate_se3, inverse_se3, orthonormalised
 from fields.geometry.similarity import motion_around, moved_points, moved_pose, scale_of
 from fields.map.gaussian_motion import GaussianMotion
 from fields.map.gaussians import NO_ANCHOR
-from fields.map.keyframe import NO_MOTION, Keyframe
+from fields.map.keyframe import Keyframe
 from fields.map.keyframes import KeyframeStore
 from pipelines.companions.paging import Paging
 from pipelines.densify.densifier import Densifier
 from pipelines.render.spherical_harmonics import sh_rotation
 from pipelines.settings import CorrectionSettings
 
-__all__ = ["CorrectionReport", "MapCorrector", "WorldMotion", "pending_motion_in_pixels", "revise"]
+__all__ = ["CorrectionReport", "MapCorrector", "WorldMotion", "motion_in_pixels", "revise"]
 
+NO_MOTION = np.eye(4)
 # Minimum number of moved points to estimate a keyframe's change of scale.
 MIN_POINTS = 10
 
@@ -98,6 +100,7 @@ class MapCorrector:
 
     Attributes:
         motion: Moves the Gaussians.
+        pending: Similarity (4, 4) of the world around a keyframe, by its index, that its Gaussians have yet to follow.
     """
 
     def __init__(self, keyframes: KeyframeStore, densifier: Densifier, paging: Paging) -> None:
@@ -105,6 +108,7 @@ class MapCorrector:
         self.densifier = densifier
         self.paging = paging
         self.motion = GaussianMotion(densifier.gaussians)
+        self.pending: dict[int, NDArray[np.float64]] = {}
 
     def correct(
         self, correction: PoseCorrection, settings: CorrectionSettings, more: bool = False
@@ -122,10 +126,14 @@ class MapCorrector:
         """
         former = self.keyframes[0].camera if len(self.keyframes) else None
         around = revise(self.keyframes, correction)
+        for view in self.keyframes:
+            if view.index in around:
+                self.pending[view.index] = around[view.index] @ self.pending.get(view.index, NO_MOTION)
         if correction.camera is not None and former is not None and settings.enabled:
             self._move_gaussians((correction.camera, former))
             return around, np.arange(len(self.keyframes))
-        pending = np.array([pending_motion_in_pixels(view) for view in self.keyframes])
+        moved = (motion_in_pixels(view, self.pending.get(view.index, NO_MOTION)) for view in self.keyframes)
+        pending = np.fromiter(moved, np.float64, len(self.keyframes))
         if more or not (settings.enabled and (pending > settings.min_pixels).any()):
             return around, np.zeros(0, dtype=np.int64)
         self._move_gaussians()
@@ -141,13 +149,9 @@ class MapCorrector:
         anchors, voxels = self.densifier.anchors, self.densifier.voxels
         degree = self.densifier.gaussians.sh_degree
         no_turn = sh_rotation(degree, np.eye(3))
-        turns = {
-            view.index: sh_rotation(degree, view.pending_motion[:3, :3] / scale_of(view.pending_motion))
-            for view in self.keyframes
-            if view.pending_motion is not NO_MOTION
-        }
+        turns = {index: sh_rotation(degree, S[:3, :3] / scale_of(S)) for index, S in self.pending.items()}
         if anchors:
-            S = np.stack([anchor.keyframe.pending_motion for anchor in anchors])
+            S = np.stack([self.pending.get(anchor.keyframe.index, NO_MOTION) for anchor in anchors])
             turn = np.stack([turns.get(anchor.keyframe.index, no_turn) for anchor in anchors])
 
             def move(first: int) -> None:
@@ -160,12 +164,22 @@ class MapCorrector:
             for anchor, scale in zip(anchors, scale_of(S).tolist(), strict=True):
                 anchor.spacing *= scale * growth
         if voxels is not None:
-            first = self.keyframes[0].pending_motion
+            first = self.pending.get(self.keyframes[0].index, NO_MOTION)
             origin = moved_points(first, voxels.origin[None])[0]
             coarsest = voxels.coarsest * float(scale_of(first)) * growth
             self.densifier.restart_voxels(coarsest, origin, *self.paging.placed())
-        for view in self.keyframes:
-            view.pending_motion = NO_MOTION
+        self.pending.clear()
+
+    def state(self) -> dict[str, NDArray]:
+        """Return the pending motions as arrays, for `restore`."""
+        motions = np.array(list(self.pending.values())).reshape(-1, 4, 4)
+        return {"index": np.array(list(self.pending), dtype=np.int64), "S": motions}
+
+    def restore(self, state: Mapping[str, NDArray]) -> None:
+        """Restore the result of `state`. Raises KeyError or ValueError if the arrays do not fit together."""
+        if state["S"].shape != (len(state["index"]), 4, 4) or not np.isfinite(state["S"]).all():
+            raise ValueError(f"the motions are {state['S'].shape} of {len(state['index'])} keyframes, or not finite")
+        self.pending = dict(zip(state["index"].tolist(), np.array(state["S"]), strict=True))
 
     def _on_new_rays(self, revision: CameraRevision, former: PinholeCamera, first: int) -> NDArray[np.float64]:
         """Positions (N, 3) of Gaussians from `first` on, at their depths on the new rays of their anchors' pixels."""
@@ -183,7 +197,7 @@ def revise(store: KeyframeStore, correction: PoseCorrection) -> dict[int, NDArra
     """Apply a correction to the tracked poses of all frames, and to the poses, points, depths and camera of keyframes.
 
     Corrected frames take the pose that the correction names, and all others move with the world around them unless they
-    stay. The Gaussians are not moved. Each keyframe's `pending_motion` accumulates the motion that they have to follow.
+    stay. The Gaussians are not moved.
 
     Args:
         store: The keyframes, with the trajectory. Corrected frames that it does not contain are ignored.
@@ -221,21 +235,19 @@ def revise(store: KeyframeStore, correction: PoseCorrection) -> dict[int, NDArra
     return {i: S for i, (_, S) in after.items() if not np.array_equal(S, NO_MOTION)}
 
 
-def pending_motion_in_pixels(view: Keyframe) -> float:
-    """Displacement of a keyframe's image by the motion that its Gaussians have not followed yet [px].
+def motion_in_pixels(view: Keyframe, S: NDArray[np.float64]) -> float:
+    """Displacement of a keyframe's image by a motion S (4, 4) that its Gaussians have not followed yet [px].
 
     This is the mean over a grid of pixels at the keyframe's median depth; infinite if one of them would lie behind or
     too close to the camera.
     """
-    if view.pending_motion is NO_MOTION or np.array_equal(view.pending_motion, NO_MOTION):
+    if np.array_equal(S, NO_MOTION):
         return 0.0
     camera = view.camera
     across, down = (np.arange(0.1, 1.0, 0.2) * side for side in (camera.width, camera.height))
     grid = np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
     here = camera.unproject(grid, np.full(len(grid), view.median_depth))
-    there = moved_points(
-        view.T_camera_world @ np.linalg.inv(view.pending_motion) @ inverse_se3(view.T_camera_world), here
-    )
+    there = moved_points(view.T_camera_world @ np.linalg.inv(S) @ inverse_se3(view.T_camera_world), here)
     if (there[:, 2] < 1e-3 * view.median_depth).any():
         return float("inf")
     return float(np.linalg.norm(camera.project(there) - grid, axis=1).mean())

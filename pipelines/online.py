@@ -132,10 +132,8 @@ class OnlineMapper(Pipeline):
             if self.gate.refuses(frame, last, self.renderer, self.near):
                 return FrameReport(frame.index, False, len(self.keyframes.selected), self.gaussian_count, None)
             is_wanted = self.selector.is_keyframe(frame, last) and self.pace.takes_keyframe()
-            if is_wanted:
-                self.paging.before_keyframe(frame)
-            elif len(self.keyframes):
-                self.paging.before_points(frame)
+            for companion in self.companions:
+                companion.before_frame(frame, is_wanted)
             is_keyframe = is_wanted and self.budget.takes_keyframe(frame)
         psnr, steps = None, 0
         if is_keyframe:
@@ -152,13 +150,14 @@ class OnlineMapper(Pipeline):
                 # The budget has no room for this keyframe, so the existing ones are optimised instead. Far from them,
                 # every frame is selected as a keyframe; each therefore gets only 1 / max_gap of the steps.
                 steps = -(-self.pace.plan(0, *self.counts).steps // self.settings.keyframes.max_gap)
-                psnr = self._optimise_evenly(self.keyframes.near(), steps, self.settings.views.per_step)
+                psnr = self._optimise_evenly(self.paging.near(), steps, self.settings.views.per_step)
         return FrameReport(frame.index, is_keyframe, len(self.keyframes.selected), self.gaussian_count, psnr, steps)
 
     def _append(self, frame: TrackedFrame, is_between: bool = False) -> Keyframe:
         """Add a frame to the views of the map."""
         view = self.keyframes.append(frame, is_between)
-        self.paging.away.look(len(self.keyframes) - 1)
+        for companion in self.companions:
+            companion.after_view(len(self.keyframes) - 1)
         return view
 
     def _add_keyframe(self, frame: TrackedFrame) -> tuple[float | None, int]:
@@ -200,7 +199,7 @@ class OnlineMapper(Pipeline):
             return None
         poses = self.settings.poses
         with self.stopwatch.measure("select"):
-            self.views.begin(self.keyframes)
+            self.views.begin(self.keyframes, self.paging.near())
         for step in range(steps):
             with self.stopwatch.measure("select"):
                 views = self.views.select(self.keyframes)
@@ -238,7 +237,7 @@ class OnlineMapper(Pipeline):
         """
         if len(self.keyframes) == 0:
             return None
-        return self._optimise_evenly(self.keyframes.near(), 1, self.settings.views.global_views)
+        return self._optimise_evenly(self.paging.near(), 1, self.settings.views.global_views)
 
     def correct(self, correction: PoseCorrection, more: bool = False) -> CorrectionReport:
         """Apply poses and points that the tracker has revised, see `MapCorrector`.
@@ -250,7 +249,7 @@ class OnlineMapper(Pipeline):
             self.optimiser.settle()
             around, moved = self.corrector.correct(correction, settings, more)
         if len(moved):
-            seen = np.intersect1d(moved, self.keyframes.near())
+            seen = np.intersect1d(moved, self.paging.near())
             self._optimise_evenly(seen, self.pace.steps_after_correction(*self.counts), settings.views)
         return CorrectionReport(around, moved=len(moved) > 0)
 

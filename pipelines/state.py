@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +45,25 @@ class MapState:
         return {name[len(start) :]: array for name, array in self.arrays.items() if name.startswith(start)}
 
 
+class Saved(Protocol):
+    """What saves its own tables by keyframe."""
+
+    def state(self) -> dict[str, NDArray]: ...
+
+    def restore(self, state: Mapping[str, NDArray], /) -> None: ...
+
+
+def _tables(mapper: OnlineMapper) -> dict[str, Saved]:
+    """What keeps tables of frames or keyframes, by the name of their group."""
+    optimiser = mapper.optimiser
+    return {
+        "tracked": mapper.trajectory,
+        "poses": optimiser.poses.moments,
+        "exposures": optimiser.exposure.moments,
+        "corrections": mapper.corrector,
+    }
+
+
 def save_state(mapper: OnlineMapper) -> MapState:
     """Return everything that the next frame or step depends on, except the keyframes' images.
 
@@ -56,7 +75,7 @@ def save_state(mapper: OnlineMapper) -> MapState:
     groups = {
         "gaussians": mapper.gaussians.to_numpy() | mapper.gaussians.history(),
         "keyframes": keyframe_arrays(mapper.keyframes),
-        "tracked": mapper.trajectory.state(),
+        **{group: table.state() for group, table in _tables(mapper).items()},
         "anchors": {
             "keyframe": np.array([place[anchor.keyframe.index] for anchor in anchors], dtype=np.int64),
             "spacing": np.array([anchor.spacing for anchor in anchors]),
@@ -64,6 +83,7 @@ def save_state(mapper: OnlineMapper) -> MapState:
     }
     numbers: dict[str, Any] = {
         "frames": mapper.frame_count,
+        "places": sorted(mapper.keyframes.begins),
         "settled": mapper.settled,
         "sweep_due": mapper.hidden.due,
         "view_renders": mapper.renderer.view_renders,
@@ -76,7 +96,7 @@ def save_state(mapper: OnlineMapper) -> MapState:
         numbers |= {"coarsest": voxels.coarsest, "origin": voxels.origin.tolist()}
     if len(mapper.paging.away):
         groups["blocks"] = mapper.paging.away.state()
-        numbers["most_missing"] = mapper.keyframes.most_missing
+        numbers["most_missing"] = mapper.paging.most_missing
     if mapper.settled:
         groups["settling"] = {"group": mapper.paging.group}
     if mapper.selector.previous is not None:
@@ -96,7 +116,8 @@ def restore_state(mapper: OnlineMapper, state: MapState, frames: Iterable[Tracke
     Raises:
         KeyError, TypeError, ValueError: If the state does not fit. The map is then unusable.
     """
-    mapper.trajectory.restore(state.group("tracked"))
+    for group, table in _tables(mapper).items():
+        table.restore(state.group(group))
     rows = KeyframeRows(state.group("keyframes"))
     blocks = state.group("blocks")
     on_disk = set(blocks["images"].tolist()) if blocks else ()
@@ -113,10 +134,11 @@ def restore_state(mapper: OnlineMapper, state: MapState, frames: Iterable[Tracke
     if len(mapper.keyframes) != len(rows.rows):
         raise ValueError(f"{len(mapper.keyframes)} of the {len(rows.rows)} keyframes are among the frames")
     mapper.keyframes.take_in_depths()
+    mapper.keyframes.begins = set(state.numbers["places"])
     mapper.gaussians.restore(state.group("gaussians"))
     if blocks:
         mapper.paging.away.restore(blocks)
-        mapper.keyframes.most_missing = int(state.numbers["most_missing"])
+        mapper.paging.most_missing = int(state.numbers["most_missing"])
     if settling := state.group("settling"):
         mapper.paging.group = settling["group"]
     anchors = state.group("anchors")
@@ -133,8 +155,8 @@ def restore_state(mapper: OnlineMapper, state: MapState, frames: Iterable[Tracke
     if previous and mapper.selector.previous not in mapper.trajectory:
         raise ValueError(f"frame {mapper.selector.previous} has no tracked pose")
     mapper.frame_count = int(state.numbers["frames"])
-    mapper.settled = int(state.numbers.get("settled", 0))  # absent in snapshots of earlier commits
-    mapper.hidden.due = int(state.numbers.get("sweep_due", mapper.hidden.due))  # absent likewise
+    mapper.settled = int(state.numbers["settled"])
+    mapper.hidden.due = int(state.numbers["sweep_due"])
     mapper.renderer.view_renders = int(state.numbers["view_renders"])
     mapper.rng.bit_generator.state = state.numbers["random"]
     mapper.gate.restore(state.numbers["gate"])

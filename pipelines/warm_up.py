@@ -42,6 +42,7 @@ def warm_up(mapper: OnlineMapper) -> None:
             first.exposure = view.exposure = np.array(IDENTITY)
         optimiser.step(store, [1], optimiser.rates(1.0), pose_rate=0.0)
         optimiser.settle()
+        optimiser.exposure.moments.forget(view.index)
         depth.estimate(view, [first], pixels)
         mapper.hidden.contribution.begin()
         mapper.hidden.contribution.measure(store, settings.near)

@@ -17,18 +17,7 @@ from fields.geometry.se3 import inverse_se3, orthonormalised
 from fields.geometry.similarity import moved_points, scale_of
 from fields.map.trajectory import Trajectory
 
-__all__ = ["NO_MOTION", "Keyframe", "median_depth_of", "nbytes_of"]
-
-
-def _unchanging(array: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Make a default value read-only, so that all keyframes can share it. A long recording has thousands."""
-    array.flags.writeable = False
-    return array
-
-
-NO_MOTION = _unchanging(np.eye(4))
-NO_POSE_MOMENT = _unchanging(np.zeros(6))
-NO_EXPOSURE_MOMENT = _unchanging(np.zeros((3, 4)))
+__all__ = ["Keyframe", "median_depth_of", "nbytes_of"]
 
 
 @dataclass(slots=True)
@@ -48,25 +37,14 @@ class Keyframe:
         median_depth: Median depth of the tracked points [scene units].
         error: Mean absolute error when the keyframe was last optimised, err(j) of Eq. 2.
         pyramid: Images at halved sizes, the first at the size of `rgba`.
-        pose_m: First moment (6,) of Adam on the pose.
-        pose_v: Second moment (6,) of Adam on the pose.
-        pose_steps: Number of Adam steps of the pose.
         vignette: Vignette as in `TrackedFrame`, at full size.
         exposure: Affine colour transform (A, b) (3, 4), image = (A colour + b) vignette; None if exposure is not
             estimated.
-        exposure_m: First moment (3, 4) of Adam on the exposure.
-        exposure_v: Second moment (3, 4) of Adam on the exposure.
-        exposure_steps: Number of Adam steps of the exposure.
-        begins_place: Whether it is the first keyframe at a place of its own, apart from the map so far. Steps change
-            neither its pose nor its exposure, which is the identity.
-        pending_motion: Similarity (4, 4) of the world around the keyframe, by the tracker's corrections, that its
-            Gaussians have not followed yet.
         is_between: Whether it is a frame between keyframes. The map is optimised on it as on a keyframe, but gets only
             its tracked points.
         transient: Weights (h, w) uint8 of the parts of the image that move, on a coarse grid: 0 where the image shows
             something that moves, 255 elsewhere. None if nothing moves. `rgba` and `pyramid` contain them.
         unmasked: The pyramid without these weights; empty if nothing moves.
-        missing: Number of Gaussians in blocks on disk that it sees, see `pipelines.companions.away`.
     """
 
     index: int
@@ -78,20 +56,11 @@ class Keyframe:
     median_depth: float
     error: float
     pyramid: tuple[ImageLevel, ...] = ()
-    pose_m: NDArray[np.float64] = field(default_factory=lambda: NO_POSE_MOMENT)
-    pose_v: NDArray[np.float64] = field(default_factory=lambda: NO_POSE_MOMENT)
-    pose_steps: int = 0
     vignette: NDArray[np.float32] | None = None
     exposure: NDArray[np.float64] | None = None
-    exposure_m: NDArray[np.float64] = field(default_factory=lambda: NO_EXPOSURE_MOMENT)
-    exposure_v: NDArray[np.float64] = field(default_factory=lambda: NO_EXPOSURE_MOMENT)
-    exposure_steps: int = 0
-    begins_place: bool = False
-    pending_motion: NDArray[np.float64] = field(default_factory=lambda: NO_MOTION)
     is_between: bool = False
     transient: NDArray[np.uint8] | None = None
     unmasked: tuple[ImageLevel, ...] = ()
-    missing: int = 0
 
     @property
     def image_bytes(self) -> int:
@@ -150,8 +119,8 @@ class Keyframe:
     def follow(self, T_before: NDArray[np.float64], S: NDArray[np.float64]) -> None:
         """Follow the tracked pose after the tracker has revised it.
 
-        The refinement of the pose is kept, with its translation scaled by S. Adam's moments are kept unchanged, since
-        they are in pixels of this camera. The tracked points and the median depth move with the world.
+        The refinement of the pose is kept, with its translation scaled by S. The tracked points and the median depth
+        move with the world.
 
         Args:
             T_before: Tracked pose T_camera_world (4, 4) before the revision.
@@ -166,7 +135,6 @@ class Keyframe:
         self.T_camera_world = T_tracked.copy() if unrefined else orthonormalised(correction @ T_tracked)
         self.points = replace(self.points, xyz=moved_points(S, self.points.xyz))
         self.median_depth *= float(scale_of(S))
-        self.pending_motion = S @ self.pending_motion
 
     def revise_camera(self, revision: CameraRevision, vignette: NDArray[np.float32] | None) -> None:
         """Take a new camera: the image with its pyramid, the vignette and the tracked points change with it.

@@ -19,19 +19,7 @@ NUMBERS: dict[str, tuple[int, ...]] = {
     "T_camera_world": (4, 4),
     "median_depth": (),
     "error": (),
-    "pose_m": (6,),
-    "pose_v": (6,),
-    "pose_steps": (),
-    "exposure_m": (3, 4),
-    "exposure_v": (3, 4),
-    "exposure_steps": (),
-    "lag": (4, 4),
 }
-# Names in a snapshot that differ from the name of the field.
-FIELDS = {"lag": "pending_motion"}
-WHOLE = ("index", "pose_steps", "exposure_steps")
-# Flags. Snapshots of version 0.2 do not have them.
-KINDS = ("is_between", "begins_place")
 POINTS = {"xyz": 3, "pixels": 2}
 NO_MASK = np.zeros((0, 0), dtype=np.uint8)
 
@@ -43,7 +31,7 @@ def keyframe_arrays(store: Iterable[Keyframe]) -> dict[str, NDArray]:
         store: The keyframes.
 
     Returns:
-        One array per field of `NUMBERS` and `KINDS`, and `exposure`, with one row per keyframe. The rows of `exposure`
+        One array per field of `NUMBERS`, `exposure` and `is_between`, with one row per keyframe. The rows of `exposure`
         are NaN for keyframes without one. `points` holds the number of tracked points of each keyframe; `xyz` (P, 3),
         `pixels` (P, 2) and `ids` (P,) hold the points of all keyframes, concatenated. If anything moves, `transient`
         holds the masks of all keyframes, concatenated, and `transient_size` (N, 2) their sizes, 0 without a mask.
@@ -51,15 +39,14 @@ def keyframe_arrays(store: Iterable[Keyframe]) -> dict[str, NDArray]:
     views = list(store)
     arrays: dict[str, NDArray] = {
         name: np.array(
-            [getattr(view, FIELDS.get(name, name)) for view in views], dtype=np.int64 if name in WHOLE else np.float64
+            [getattr(view, name) for view in views], dtype=np.int64 if name == "index" else np.float64
         ).reshape(-1, *shape)
         for name, shape in NUMBERS.items()
     }
     unknown = np.full((3, 4), np.nan)
     exposures = [unknown if view.exposure is None else view.exposure for view in views]
     arrays["exposure"] = np.array(exposures).reshape(-1, 3, 4)
-    for name in KINDS:
-        arrays[name] = np.array([getattr(view, name) for view in views], dtype=np.int64)
+    arrays["is_between"] = np.array([view.is_between for view in views], dtype=np.int64)
     arrays["points"] = np.array([len(view.points) for view in views], dtype=np.int64)
     for name, width in POINTS.items():
         parts = [getattr(view.points, name) for view in views]
@@ -88,15 +75,11 @@ class KeyframeRows:
 
     def __init__(self, arrays: Mapping[str, NDArray]) -> None:
         count = len(arrays["index"])
-        for name, shape in {**NUMBERS, "exposure": (3, 4)}.items():
+        for name, shape in {**NUMBERS, "exposure": (3, 4), "is_between": ()}.items():
             if arrays[name].shape != (count, *shape):
                 raise ValueError(f"{name} has shape {arrays[name].shape}, expected {(count, *shape)}")
             if name != "exposure" and not np.isfinite(arrays[name]).all():
                 raise ValueError(f"{name} is not finite")
-        self._kinds = {name: arrays.get(name, np.zeros(count, dtype=np.int64)) for name in KINDS}
-        for name, kind in self._kinds.items():
-            if kind.shape != (count,):
-                raise ValueError(f"{name} has shape {kind.shape}, expected {(count,)}")
         total = int(arrays["points"].sum())
         if arrays["points"].shape != (count,) or (arrays["points"] < 0).any() or len(arrays["ids"]) != total:
             raise ValueError(f"{len(arrays['ids'])} tracked points, {total} are announced")
@@ -123,12 +106,9 @@ class KeyframeRows:
         row = len(store)
         if self.rows.get(frame.index) != row:
             raise ValueError(f"frame {frame.index} is not keyframe {row}")
-        view = store.append(frame, bool(self._kinds["is_between"][row]))
-        view.begins_place = bool(self._kinds["begins_place"][row])
-        for name, shape in NUMBERS.items():
-            value = self._arrays[name][row]
-            plain = int(value) if name in WHOLE else float(value) if shape == () else np.array(value)
-            setattr(view, FIELDS.get(name, name), plain)
+        view = store.append(frame, bool(self._arrays["is_between"][row]))
+        view.T_camera_world = np.array(self._arrays["T_camera_world"][row])
+        view.median_depth, view.error = (float(self._arrays[name][row]) for name in ("median_depth", "error"))
         exposure = self._arrays["exposure"][row]
         view.exposure = None if np.isnan(exposure).all() else np.array(exposure)
         own = slice(self._first[row], self._first[row + 1])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left
+from bisect import bisect_left, insort
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
@@ -13,13 +13,38 @@ from fields.frames.pyramid import ImageLevel
 from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from fields.geometry.se3 import camera_centres, interpolate_se3
 from fields.map.keyframe import Keyframe, median_depth_of, nbytes_of
-from fields.map.running_median import RunningMedian
 from fields.map.trajectory import Trajectory
 
-__all__ = ["FAR", "KeyframeStore", "centres_of"]
+__all__ = ["FAR", "KeyframeStore", "RunningMedian", "centres_of"]
 
 # Distance beyond which a keyframe is of another place [scene depths].
 FAR = 3.0
+
+
+class RunningMedian:
+    """Median of the values added so far, kept in a sorted list."""
+
+    def __init__(self) -> None:
+        self._sorted: list[float] = []
+
+    def __len__(self) -> int:
+        return len(self._sorted)
+
+    def add(self, value: float) -> None:
+        """Add a value."""
+        insort(self._sorted, value)
+
+    @property
+    def value(self) -> float:
+        """Median of the values; the mean of the middle two if their number is even.
+
+        Raises:
+            IndexError: If no value has been added.
+        """
+        middle = len(self._sorted) // 2
+        if len(self._sorted) % 2:
+            return self._sorted[middle]
+        return 0.5 * (self._sorted[middle - 1] + self._sorted[middle])
 
 
 class KeyframeStore:
@@ -34,7 +59,8 @@ class KeyframeStore:
         latest: Place of the last of these in the store; -1 without keyframes.
         views: Number of views that are taken at one time, as in `TrackedFrame`.
         nbytes: Bytes of the keyframes' images and points.
-        most_missing: Number of Gaussians on disk that a keyframe may see and still be drawn as a view.
+        begins: Indices of the keyframes with which a further place begins, apart from the map so far. Steps change
+            neither their poses nor their exposures, which are the identity.
     """
 
     def __init__(self, levels: int = 1, min_side: int = 1, trajectory: Trajectory | None = None) -> None:
@@ -54,7 +80,7 @@ class KeyframeStore:
         self.views = 1
         self._depths = RunningMedian()
         self.nbytes = 0
-        self.most_missing = 0
+        self.begins: set[int] = set()
 
     def __len__(self) -> int:
         return len(self._keyframes)
@@ -72,13 +98,8 @@ class KeyframeStore:
 
     @property
     def place_begins(self) -> int:
-        """Index of the frame with which the latest place of its own began; 0 if there is none, see `begins_place`."""
-        return max((k.index for k in self._keyframes if k.begins_place), default=0)
-
-    @property
-    def has_places(self) -> bool:
-        """Whether a further place has begun apart from the first one, see `begins_place`."""
-        return any(k.begins_place for k in self._keyframes)
+        """Index of the frame with which the latest further place began; 0 if there is none, see `begins`."""
+        return max(self.begins, default=0)
 
     def bytes_of(self, frame: TrackedFrame) -> int:
         """Return the number of bytes that a frame would take as a keyframe."""
@@ -172,20 +193,6 @@ class KeyframeStore:
             keyframe.rgba = keyframe.pyramid[0].rgba
             self.nbytes += keyframe.nbytes
 
-    def near(self) -> NDArray[np.int64]:
-        """Return the places (M,) of the keyframes around the latest one, of which views are drawn.
-
-        They miss at most `most_missing` Gaussians. If parts of the map lie on disk, or it has places apart, they are
-        also at most FAR away. Otherwise, what is in memory of an earlier place would be drawn as often as the present
-        one.
-        """
-        missing = np.fromiter((k.missing for k in self._keyframes), np.int64, len(self._keyframes))
-        places = np.flatnonzero(missing <= self.most_missing)
-        if (missing.any() or self.has_places) and len(places) and self.latest >= 0:
-            centres = centres_of([self._keyframes[place] for place in places])
-            places = places[~self.far(centres, [self._keyframes[self.latest]])]
-        return places
-
     def far(self, centres: NDArray[np.float64], views: Sequence[Keyframe]) -> NDArray[np.bool_]:
         """Return which of the camera centres (K, 3) are more than FAR away from each of the views."""
         distance = np.linalg.norm(centres[:, None] - centres_of(views), axis=2)
@@ -267,7 +274,7 @@ class KeyframeStore:
             nearest = every[min(after, len(every) - 1)]
             return nearest, nearest, 0.0
         a, b = every[after - 1], every[after]
-        if b.begins_place and index < b.index:
+        if b.index in self.begins and index < b.index:
             nearest = a if index - a.index < b.index - index else b
             return nearest, nearest, 0.0
         return a, b, (index - a.index) / (b.index - a.index)

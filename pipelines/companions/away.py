@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -44,7 +45,7 @@ class BlockOnDisk:
 class BlocksOnDisk:
     """The blocks of a map that lie on disk, in the order in which they went there.
 
-    A keyframe that sees a block on disk misses its Gaussians (`Keyframe.missing`), and lies on disk as well.
+    A keyframe that sees a block on disk misses its Gaussians, and lies on disk as well.
 
     Args:
         gaussians: The resident Gaussians.
@@ -53,6 +54,7 @@ class BlocksOnDisk:
 
     Attributes:
         sweep: Number of the sweep in which coverages are measured, see `HiddenGaussians`.
+        missing: Number of Gaussians on disk that a keyframe sees, by its index.
     """
 
     def __init__(self, gaussians: GaussianField, keyframes: KeyframeStore, folder: Path | None) -> None:
@@ -63,6 +65,7 @@ class BlocksOnDisk:
         self._added = 0
         self._planes: list[tuple[NDArray[np.float64], float, NDArray[np.float64]]] = []  # pose, far and planes
         self.sweep = 0
+        self.missing: Counter[int] = Counter()
         # Numbers, boxes and counts of the blocks in arrays, and what came and went since these were made.
         self._numbers = np.zeros(0, dtype=np.int64)
         self._boxes = Boxes.joined([])
@@ -134,7 +137,7 @@ class BlocksOnDisk:
         self._added += 1
         self._came.append((block, box))
         for place in viewers.tolist():
-            self.keyframes[place].missing += stored.count
+            self.missing[self.keyframes[place].index] += stored.count
         return block
 
     def store_keyframes(self, keyframes: Sequence[Keyframe]) -> None:
@@ -152,7 +155,7 @@ class BlocksOnDisk:
         self._gone.append(block.number)
         self._files.forget(block.stored)
         for place in block.viewers.tolist():
-            self.keyframes[place].missing -= block.stored.count
+            self.missing[self.keyframes[place].index] -= block.stored.count
 
     def fetch(self, blocks: Sequence[BlockOnDisk]) -> None:
         """Append the Gaussians of blocks to the resident ones, in order, and remove the blocks from here.
@@ -244,16 +247,15 @@ class BlocksOnDisk:
         if self._blocks:
             for block in self.at(np.flatnonzero(seen(planes_of_views([keyframe]), self.boxes)[0])):
                 block.viewers = np.append(block.viewers, place)
-                keyframe.missing += block.stored.count
+                self.missing[keyframe.index] += block.stored.count
 
     def look_again(self) -> None:
         """Determine again which keyframes see which blocks, after their poses have changed."""
-        for view in self.keyframes:
-            view.missing = 0
+        self.missing.clear()
         for block, viewers in zip(self, self.viewers(self.boxes), strict=True):
             block.viewers = viewers
             for place in viewers.tolist():
-                self.keyframes[place].missing += block.stored.count
+                self.missing[self.keyframes[place].index] += block.stored.count
 
     def _all_planes(self) -> NDArray[np.float64]:
         """Planes (K, 6, 4) of all keyframes. Those of keyframes that have not moved are taken from the last call."""

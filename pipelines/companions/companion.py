@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from fields.frames.tracked_frame import TrackedFrame
 from fields.map.keyframe import Keyframe
 
 __all__ = ["Companion"]
@@ -18,6 +19,17 @@ class Companion:
     A mapper has a list of companions, which are called in its order. One that draws random numbers draws them from the
     mapper's generator, so that the order is part of the result.
     """
+
+    def before_frame(self, frame: TrackedFrame, is_wanted: bool) -> None:
+        """Called with each frame that reaches the map before it is added to it.
+
+        Args:
+            frame: The frame.
+            is_wanted: Whether it should become a keyframe, if the memory budget has room for it.
+        """
+
+    def after_view(self, place: int) -> None:
+        """Called when a frame has become a view of the map, at this place in the store."""
 
     def before_step(self) -> None:
         """Called before each optimisation step."""

@@ -110,9 +110,9 @@ class HiddenGaussians(Companion):
         self._left_out = []
 
     def _near(self, views: Sequence[Keyframe]) -> list[Keyframe]:
-        """Return the views that are near, see `KeyframeStore.near`. The others are left out."""
+        """Return the views that are near, see `Paging.near`. The others are left out."""
         store = self._densifier.keyframes
-        near = {store[place].index for place in store.near().tolist()}
+        near = {store[place].index for place in self._paging.near().tolist()}
         self._left_out += [view for view in views if view.index not in near]
         return [view for view in views if view.index in near]
 

@@ -42,10 +42,10 @@ class OtherPlaces(Companion):
     def before_step(self) -> None:
         """Note where the keyframes are that have placed Gaussians.
 
-        Does nothing, like `before_update`, if the map has no places apart, see `KeyframeStore.has_places`.
+        Does nothing, like `before_update`, if the map has no places apart, see `KeyframeStore.begins`.
         """
         store = self._densifier.keyframes
-        if store.has_places:
+        if store.begins:
             self._centres = centres_of(store.selected)
             self._places = self._densifier.places_of_anchors()
 
@@ -59,7 +59,7 @@ class OtherPlaces(Companion):
             views: The views of an Adam step, whose gradients have been accumulated.
         """
         store = self._densifier.keyframes
-        if self.gaussians.count and store.has_places:
+        if self.gaussians.count and store.begins:
             held = store.far(self._centres, views)[self._places]
             self._hold(self.gaussians.count, held.astype(np.int32), float(np.log(LARGEST * store.scene_depth)))
 

@@ -12,7 +12,7 @@ from fields.frames.tracked_frame import TrackedFrame
 from fields.map.blocks import Blocks, Boxes, divide, extent_of, seen
 from fields.map.gaussians import GaussianField
 from fields.map.keyframe import Keyframe
-from fields.map.keyframes import KeyframeStore
+from fields.map.keyframes import KeyframeStore, centres_of
 from fields.runtime.heap import give_back_heap
 from pipelines.companions.away import CHUNK, BlocksOnDisk, planes_of_views
 from pipelines.companions.companion import Companion
@@ -55,6 +55,7 @@ class Paging(Companion):
     Attributes:
         away: The blocks on disk.
         group: Group (K,) of each keyframe after `plan`.
+        most_missing: Number of Gaussians on disk that a keyframe may see and still be drawn as a view.
         problem: Why nothing can go to disk any more; None if it can.
     """
 
@@ -72,6 +73,7 @@ class Paging(Companion):
         self.settings = settings
         self.away = BlocksOnDisk(gaussians, keyframes, folder)
         self.group = np.zeros(0, dtype=np.int64)
+        self.most_missing = 0
         self.problem: str | None = None
 
     @property
@@ -116,18 +118,32 @@ class Paging(Companion):
 
     # ---- while the map grows ---------------------------------------------------------------------------------
 
-    def before_keyframe(self, frame: TrackedFrame) -> None:
-        """Bring in what a frame sees, and make room for what it adds as a keyframe. Call it between two steps.
+    def before_frame(self, frame: TrackedFrame, is_wanted: bool) -> None:
+        """Make room for what a frame adds, and bring in what it sees if it should become a keyframe.
 
         Raises:
             BlockError: If a block's file is missing or damaged. The map is then without it.
         """
         area = frame.camera.width * frame.camera.height / (640 * 480)
-        self._prepare(frame, round(self.settings.densify.pixels * area**0.75), bring=True)
+        self._prepare(frame, round(self.settings.densify.pixels * area**0.75) if is_wanted else 0, bring=is_wanted)
 
-    def before_points(self, frame: TrackedFrame) -> None:
-        """Make room for the tracked points of a frame that is no keyframe. Call it between two steps."""
-        self._prepare(frame, 0, bring=False)
+    def after_view(self, place: int) -> None:
+        self.away.look(place)
+
+    def near(self) -> NDArray[np.int64]:
+        """Return the places (M,) of the keyframes around the latest one, of which views are drawn.
+
+        They miss at most `most_missing` Gaussians. If parts of the map lie on disk, or it has places apart, they are
+        also at most FAR away. Otherwise, what is in memory of an earlier place would be drawn as often as the present
+        one.
+        """
+        store = self.keyframes
+        missing = np.fromiter((self.away.missing[view.index] for view in store), np.int64, len(store))
+        places = np.flatnonzero(missing <= self.most_missing)
+        if (missing.any() or store.begins) and len(places) and store.latest >= 0:
+            centres = centres_of([store[place] for place in places])
+            places = places[~store.far(centres, [store[store.latest]])]
+        return places
 
     def _prepare(self, frame: TrackedFrame, pixels: int, bring: bool) -> None:
         """Make room for `pixels` Gaussians, and those at the points of a frame; `bring` in what it sees first."""
@@ -143,7 +159,7 @@ class Paging(Companion):
             self._bring([view], added, nbytes)
             position = self.gaussians.to_numpy()["position"].astype(np.float64)
             in_sight = seen(planes_of_views([view]), Boxes(position, position))
-            self.keyframes.most_missing = round(MISSING * np.count_nonzero(in_sight))
+            self.most_missing = round(MISSING * np.count_nonzero(in_sight))
 
     def rewrite(self, change: Callable[[int], None]) -> None:
         """Change the Gaussians of all blocks on disk.
@@ -187,7 +203,7 @@ class Paging(Companion):
         Raises:
             BlockError: If a block's file is missing or damaged. The map is then without it.
         """
-        if any(view.missing for view in views):
+        if any(self.away.missing[view.index] for view in views):
             self._bring(views, 0, 0)
 
     # ---- room ------------------------------------------------------------------------------------------------

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from fields.map.keyframe import Keyframe
 from fields.map.keyframes import KeyframeStore
+from pipelines.optimise.moments import Moments
 from pipelines.optimise.safeguards import Safeguards
 from pipelines.render.cpu.photometric_model import IDENTITY
 from pipelines.render.renderer import Renderer
@@ -161,9 +162,11 @@ def _is_elsewhere(store: KeyframeStore) -> bool:
 
 
 class ExposureRefinement:
-    """Adam on the exposure (A, b) of keyframes, which store its moments. New keyframes start from a fit to the map."""
+    """Adam on the exposure (A, b) of keyframes. New keyframes start from a fit to the map.
 
-    BETAS = (0.9, 0.999)
+    Attributes:
+        moments: Adam's moments of each keyframe.
+    """
 
     def __init__(self, settings: ExposureSettings, safeguards: Safeguards | None = None) -> None:
         """Create the optimiser of exposures.
@@ -174,6 +177,7 @@ class ExposureRefinement:
         """
         self.settings = settings
         self.safeguards = Safeguards() if safeguards is None else safeguards
+        self.moments = Moments(3, 4)
 
     def begin(self, store: KeyframeStore, renderer: Renderer, near: float) -> None:
         """Initialise the exposure of the latest keyframe by a fit of gains to the current render, if enabled.
@@ -204,7 +208,8 @@ class ExposureRefinement:
         renderer.forward(small.camera, view.T_camera_world, near)
         known = (renderer.images.opacity_to_numpy() > MIN_OPACITY) & (small.rgba[..., 3] > 0)
         if elsewhere and known.mean() < APART:
-            view.exposure, view.begins_place = unestimated, True
+            view.exposure = unestimated
+            store.begins.add(view.index)
             return
         if not enabled or not (estimated or any(keyframe.exposure is not None for keyframe in store)):
             return
@@ -237,10 +242,4 @@ class ExposureRefinement:
             return
         exposure = IDENTITY if view.exposure is None else view.exposure
         gradient = gradient + 2.0 * weight * self.settings.regularisation * (exposure - IDENTITY)
-        beta1, beta2 = self.BETAS
-        view.exposure_steps += 1
-        view.exposure_m = beta1 * view.exposure_m + (1 - beta1) * gradient
-        view.exposure_v = beta2 * view.exposure_v + (1 - beta2) * gradient**2
-        m = view.exposure_m / (1 - beta1**view.exposure_steps)
-        v = view.exposure_v / (1 - beta2**view.exposure_steps)
-        view.exposure = exposure - self.settings.learning_rate * m / (np.sqrt(v) + 1e-15)
+        view.exposure = exposure - self.moments.step(view.index, gradient, self.settings.learning_rate)

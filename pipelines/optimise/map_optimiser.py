@@ -179,7 +179,7 @@ class MapOptimiser:
             self.loss.backward(o.ssim_weight, 1.0 / len(views))
             self.renderer.backward()
             seen.append((view, values))
-            begins = j == 0 or view.begins_place
+            begins = j == 0 or view.index in store.begins
             if pose_rate > 0 and not begins:
                 pose_gradients.setdefault(j, []).append(self.renderer.async_camera_gradient())
             if view.exposure is not None and not begins:

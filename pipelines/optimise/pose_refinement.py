@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from fields.geometry.pixel_metric import pixel_jacobian, pixel_metric
 from fields.geometry.se3 import exp_se3, log_se3, orthonormalised
 from fields.map.keyframe import Keyframe
+from pipelines.optimise.moments import Moments
 from pipelines.optimise.safeguards import Safeguards
 
 __all__ = ["PoseRefinement", "reprojection"]
@@ -42,11 +43,13 @@ def reprojection(view: Keyframe, W: NDArray[np.float64]) -> tuple[NDArray[np.flo
 class PoseRefinement:
     """Refines T_camera_world of keyframes, T <- exp(xi) T, in the coordinates of `pixel_metric`.
 
-    The keyframe stores Adam's moments. They are expressed in its camera frame and are not transformed after a step,
-    since a step rotates that frame only slightly.
+    Adam's moments are expressed in the camera frame of their keyframe, in pixels. They are not transformed after a
+    step, which rotates that frame only slightly, nor when the tracker revises the pose.
+
+    Attributes:
+        moments: Adam's moments of each keyframe.
     """
 
-    BETAS = (0.9, 0.999)
     # Gauss-Newton steps of an alignment, and the weight of half the squared distance to the tracked pose [px^2].
     ITERATIONS = 5
     PRIOR = 0.01
@@ -60,6 +63,7 @@ class PoseRefinement:
             safeguards: Counter of rejected steps; None for a new one.
         """
         self.safeguards = Safeguards() if safeguards is None else safeguards
+        self.moments = Moments(6)
 
     def align(self, view: Keyframe) -> None:
         """Minimise the reprojection error of the view's tracked points by Gauss-Newton.
@@ -102,17 +106,10 @@ class PoseRefinement:
             self.safeguards.camera_steps += 1
             return
         before = view.T_camera_world
-        beta1, beta2 = self.BETAS
         W = pixel_metric(view.camera, view.median_depth)
-        g = W.T @ gradient
-        view.pose_steps += 1
-        view.pose_m = beta1 * view.pose_m + (1 - beta1) * g
-        view.pose_v = beta2 * view.pose_v + (1 - beta2) * g**2
-        m = view.pose_m / (1 - beta1**view.pose_steps)
-        v = view.pose_v / (1 - beta2**view.pose_steps)
-        xi = W @ (-rate * m / (np.sqrt(v) + 1e-15))
+        xi = W @ -self.moments.step(view.index, W.T @ gradient, rate)
         view.T_camera_world = orthonormalised(exp_se3(xi) @ view.T_camera_world)
         if self._runs_away(view, W):
             self.safeguards.camera_steps += 1
             view.T_camera_world = before
-            view.pose_m, view.pose_v, view.pose_steps = np.zeros(6), np.zeros(6), 0
+            self.moments.forget(view.index)

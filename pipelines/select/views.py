@@ -17,8 +17,13 @@ __all__ = ["LocalGlobalViews", "ViewSelection", "global_probabilities"]
 class ViewSelection(Protocol):
     """Protocol of a policy that selects the views of an optimisation step."""
 
-    def begin(self, store: KeyframeStore) -> None:
-        """Called before the steps on a new keyframe, which is the last of `store`."""
+    def begin(self, store: KeyframeStore, near: NDArray[np.int64]) -> None:
+        """Called before the steps on a new keyframe, which is the last of `store`.
+
+        Args:
+            store: The keyframes.
+            near: Places (M,) of those around it, see `Paging.near`.
+        """
         ...
 
     def select(self, store: KeyframeStore) -> list[int]:
@@ -47,7 +52,7 @@ def global_probabilities(
 class LocalGlobalViews:
     """Selects the latest keyframe, up to `local_views` recent ones and `global_views` from all keyframes.
 
-    Keyframes that see too much of what lies on disk are left out (`KeyframeStore.near`).
+    Keyframes that see too much of what lies on disk are left out (`Paging.near`).
 
     Local views come from a bank of the latest keyframes before the current one. They are drawn without replacement,
     in proportion to their covisibility with the current view. Global views are drawn by Eq. 2. Both draws are repeated
@@ -61,10 +66,10 @@ class LocalGlobalViews:
         self._overlap = np.zeros(0)
         self._near = np.zeros(0, dtype=np.int64)
 
-    def begin(self, store: KeyframeStore) -> None:
+    def begin(self, store: KeyframeStore, near: NDArray[np.int64]) -> None:
         last = store.latest
-        self._near = store.near()
-        self._bank = [int(j) for j in self._near if last - self.settings.bank <= j < last]
+        self._near = near
+        self._bank = [int(j) for j in near if last - self.settings.bank <= j < last]
         current = SeenPoints.of(store[last])
         self._overlap = np.array([covisibility(current, SeenPoints.of(store[j])) for j in self._bank])
 

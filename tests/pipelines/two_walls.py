@@ -32,7 +32,7 @@ def two_walls() -> OnlineMapper:
     for i in range(4):
         mapper.process(moved(frame(i), APART * (i >= 2)))
     assert len(mapper.keyframes) == 4
-    mapper.keyframes[2].begins_place = True
+    mapper.keyframes.begins.add(mapper.keyframes[2].index)
     strangers = {name: values[:STRANGERS].copy() for name, values in mapper.gaussians.to_numpy().items()}
     strangers["position"] += APART - [0.0, 0.0, 0.5]
     mapper.gaussians.append(**strangers, anchor=0)

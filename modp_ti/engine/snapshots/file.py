@@ -24,7 +24,7 @@ __all__ = ["FILE", "VERSION", "of_another_program", "read_arrays", "write_arrays
 
 FILE = "snapshot.npz"
 # Version of the arrays and the JSON. Others are refused, as they hold the state of different code.
-VERSION = 4
+VERSION = 5
 ABOUT = "about"
 
 

@@ -1,10 +1,17 @@
+"""The camera model, the metric of its pixels, and vectors in kernels."""
+
 from __future__ import annotations
 
 import cv2
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from fields.geometry.camera import PinholeCamera
+from fields.geometry.pixel_metric import pixel_metric
+from fields.geometry.se3 import exp_se3
+from fields.geometry.vec3 import cross, dot, rotate, rotate_back
+from fields.runtime.engine import ti
 
 CAMERA = PinholeCamera(500.0, 480.0, 310.0, 250.0, 640, 480)
 
@@ -56,3 +63,46 @@ def test_numbers_of_any_type_become_plain_ones() -> None:
     camera = PinholeCamera(np.float64(60), np.float32(60), 32, np.int64(24), 64.0, np.int32(48))
     assert camera == PinholeCamera(60.0, 60.0, 32.0, 24.0, 64, 48)
     assert [type(value) for value in vars(camera).values()] == [float] * 4 + [int] * 2
+
+
+LENS = PinholeCamera(40.0, 42.0, 21.0, 17.0, 43, 35)
+DEPTH = 4.0
+
+
+def test_a_unit_of_the_pixel_metric_moves_the_image_by_a_pixel() -> None:
+    x, y = np.meshgrid((np.arange(5) + 0.5) / 5 * LENS.width, (np.arange(5) + 0.5) / 5 * LENS.height)
+    pixels = np.tile(np.stack([x.ravel(), y.ravel()], axis=1), (2, 1))
+    points = LENS.unproject(pixels, np.repeat([0.6 * DEPTH, 1.6 * DEPTH], 25))
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        u = 1e-5 * rng.normal(size=6)
+        T = exp_se3(pixel_metric(LENS, DEPTH) @ u)
+        moved = LENS.project(points @ T[:3, :3].T + T[:3, 3]) - pixels
+        assert np.sqrt((moved**2).sum(axis=1).mean()) == pytest.approx(np.linalg.norm(u), rel=1e-3)
+
+
+def test_the_metric_follows_the_scale_of_the_scene() -> None:
+    W, tenth = pixel_metric(LENS, DEPTH), pixel_metric(LENS, 0.1 * DEPTH)
+    np.testing.assert_allclose(tenth[:3], 0.1 * W[:3], atol=1e-12)
+    np.testing.assert_allclose(tenth[3:], W[3:], atol=1e-12)
+
+
+def test_products_are_those_of_numpy() -> None:
+    @ti.kernel
+    def products(m: ti.types.ndarray(), a: ti.types.ndarray(), b: ti.types.ndarray(), out: ti.types.ndarray()):
+        for _ in range(1):
+            M = ti.Matrix([[m[r, c] for c in range(3)] for r in range(3)])
+            u, v = ti.Vector([a[0], a[1], a[2]]), ti.Vector([b[0], b[1], b[2]])
+            w, forth, back = cross(u, v), rotate(M, u), rotate_back(M, u)
+            for c in ti.static(range(3)):
+                out[0, c], out[1, c], out[2, c] = w[c], forth[c], back[c]
+            out[3, 0] = dot(u, v)
+
+    rng = np.random.default_rng(0)
+    m, a, b = rng.normal(size=(3, 3)), rng.normal(size=3), rng.normal(size=3)
+    out = np.zeros((4, 3))
+    products(m, a, b, out)
+    assert_allclose(out[0], np.cross(a, b), atol=1e-14)
+    assert_allclose(out[1], m @ a, atol=1e-14)
+    assert_allclose(out[2], m.T @ a, atol=1e-14)
+    assert_allclose(out[3, 0], a @ b, atol=1e-14)

@@ -1,3 +1,5 @@
+"""Keyframes: what they share, what moves with them, masks, and their state."""
+
 from __future__ import annotations
 
 from dataclasses import replace
@@ -9,8 +11,9 @@ from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import exp_se3
 from fields.geometry.similarity import motion_around
-from fields.map.keyframe_state import KINDS, KeyframeRows, keyframe_arrays
-from fields.map.keyframes import KeyframeStore
+from fields.map.covisibility import SeenPoints, covisibility
+from fields.map.keyframe_state import KeyframeRows, keyframe_arrays
+from fields.map.keyframes import KeyframeStore, RunningMedian
 
 CAMERA = PinholeCamera(10.0, 40.0, 4.0, 3.0, 8, 6)
 
@@ -48,24 +51,6 @@ def test_a_new_keyframe_starts_at_the_mean_error_and_the_first_at_one() -> None:
     assert (first.error, second.error) == (1.0, 1.0)
     first.error, second.error = 0.1, 0.3
     assert store.append(frame(2)).error == pytest.approx(0.2)
-
-
-def test_views_are_of_the_present_place_only_once_there_are_others_or_parts_of_the_map_lie_on_disk() -> None:
-    """The scene is 4 m deep, the camera moves on by 5 m a keyframe, and another place is farther than 12 m."""
-    store = KeyframeStore()
-    for index in range(6):
-        T = np.eye(4)
-        T[0, 3] = -5.0 * index
-        store.append(frame(index, T=T))
-    store.most_missing = 10
-    assert store.near().tolist() == [0, 1, 2, 3, 4, 5]
-    store[4].begins_place = True
-    assert store.near().tolist() == [3, 4, 5]
-    store[4].begins_place = False
-    store[4].missing = 1
-    assert store.near().tolist() == [3, 4, 5]
-    store[4].missing = 11
-    assert store.near().tolist() == [3, 5]
 
 
 def test_frames_between_keyframes_share_their_corrections() -> None:
@@ -126,7 +111,7 @@ def test_nothing_is_interpolated_between_two_places() -> None:
         view.exposure = np.full((3, 4), value)
         view.T_camera_world = exp_se3(share * twist) @ view.T_tracked
     assert store.place_begins == 0
-    store[1].begins_place = True
+    store.begins.add(20)
     assert store.place_begins == 20
     for index, value, share in ((10, 1.0, 1.0), (14, 1.0, 1.0), (16, 3.0, 4.0), (20, 3.0, 4.0), (21, 4.0, 4.0)):
         np.testing.assert_allclose(store.exposure_at(index), value)
@@ -139,10 +124,7 @@ def test_a_new_keyframe_starts_with_the_exposure_of_the_last_but_shares_no_memor
     new = store.append(frame(1))
     np.testing.assert_array_equal(new.exposure, np.full((3, 4), 2.0))
     new.exposure += 1.0
-    with pytest.raises(ValueError, match="read-only"):
-        new.exposure_m += 1.0
     np.testing.assert_array_equal(store[0].exposure, np.full((3, 4), 2.0))
-    np.testing.assert_array_equal(store[0].exposure_m, 0.0)
 
 
 def test_exposure_that_is_not_estimated_is_none() -> None:
@@ -170,27 +152,20 @@ def test_a_revised_keyframe_keeps_its_refinement_and_sees_the_same() -> None:
     now = keyframe.points.xyz @ keyframe.T_camera_world[:3, :3].T + keyframe.T_camera_world[:3, 3]
     np.testing.assert_allclose(now, 1.5 * seen, atol=1e-12)
     assert store.scene_depth == keyframe.median_depth == pytest.approx(6.0)
-    np.testing.assert_allclose(keyframe.pending_motion, S)
     keyframe.revise_points(SparsePoints(now @ T[:3, :3], points.pixels, points.ids))
     assert keyframe.median_depth == pytest.approx(np.median(now[:, 2]) + T[2, 3])
 
 
-def test_kinds_of_keyframes_are_told_apart_also_after_they_were_saved() -> None:
-    store, again, old = KeyframeStore(), KeyframeStore(), KeyframeStore()
+def test_kinds_of_keyframes_differ_also_after_they_were_saved() -> None:
+    store, again = KeyframeStore(), KeyframeStore()
     for index in range(5):
-        store.append(frame(index), is_between=index in (1, 3, 4)).begins_place = index == 2
-    arrays = keyframe_arrays(store)
-    rows = KeyframeRows(arrays)
+        store.append(frame(index), is_between=index in (1, 3, 4))
+    rows = KeyframeRows(keyframe_arrays(store))
     for index in range(5):
         rows.put(frame(index), again)
     for one in (store, again):
         assert [view.index for view in one.selected] == [0, 2] and one.latest == 2
         assert [view.is_between for view in one] == [False, True, False, True, True]
-        assert [view.begins_place for view in one] == [False, False, True, False, False]
-    rows = KeyframeRows({name: array for name, array in arrays.items() if name not in KINDS})
-    for index in range(5):
-        rows.put(frame(index), old)
-    assert len(old.selected) == 5 and old.latest == 4 and not any(view.begins_place for view in old)
 
 
 def masked_store() -> KeyframeStore:
@@ -254,3 +229,46 @@ def test_masks_are_saved_and_restored() -> None:
     arrays["transient"] = arrays["transient"][1:]
     with pytest.raises(ValueError, match="255 pixels of masks of what moves, 256 are announced"):
         KeyframeRows(arrays)
+
+
+NARROW = PinholeCamera(10.0, 10.0, 10.0, 10.0, 20, 20)  # sees |x| < z and |y| < z
+
+
+def view(xyz: list[list[float]], x: float = 0.0) -> SeenPoints:
+    """A camera at (x, 0, 0) with these tracked points."""
+    T = np.eye(4)
+    T[0, 3] = -x
+    return SeenPoints(NARROW, T, np.array(xyz, dtype=np.float64).reshape(-1, 3))
+
+
+def test_covisibility_is_the_shared_part() -> None:
+    # Both see the two in the middle; each has one that the other does not see.
+    a = view([[0, 0, 2], [0.5, 0, 2], [-1.9, 0, 2]])
+    b = view([[0, 0, 2], [0.5, 0, 2], [2.9, 0, 2]], x=1.0)
+    assert a.count(b.xyz) == b.count(a.xyz) == 2
+    assert covisibility(a, b) == pytest.approx(2 / (2 + 1 + 1))
+
+
+def test_points_beyond_the_farthest_are_not_seen() -> None:
+    a = view([[0, 0, 2]])
+    assert a.count(np.array([[0, 0, 2.0], [0, 0, 2.5], [0, 0, -1.0], [5, 0, 2]])) == 1
+
+
+def test_a_view_covers_itself_and_nothing_covers_no_points() -> None:
+    a = view([[0, 0, 2], [0.5, 0, 2]])
+    assert covisibility(a, a) == 1.0
+    assert covisibility(a, view([])) == 0.1
+
+
+def test_it_is_the_median_of_what_came_so_far() -> None:
+    values = np.random.default_rng(0).choice(40, 101).astype(float) / 7
+    median = RunningMedian()
+    for n, value in enumerate(values.tolist(), 1):
+        median.add(value)
+        assert len(median) == n
+        assert median.value == np.median(values[:n])
+
+
+def test_nothing_has_no_median() -> None:
+    with pytest.raises(IndexError):
+        _ = RunningMedian().value

@@ -9,7 +9,7 @@ from modp_ti.engine.mapper import Mapper
 from pipelines.companions.block_files import BlockError
 from pipelines.online import OnlineMapper
 from pipelines.settings import MappingSettings
-from tests.pipelines.blocks.long_wall import frame
+from tests.pipelines.long_wall import frame
 
 SETTINGS = MappingSettings(sh_degree=0, optimise={"steps": 1}, densify={"warm_up": 2}, max_gaussians=3072)
 

@@ -10,16 +10,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from fields.frames.tracked_frame import TrackedFrame
 from fields.map.keyframe import Keyframe
 from fields.map.keyframes import KeyframeStore
 from fields.runtime.backend import initialise
 from pipelines.online import OnlineMapper
-from pipelines.optimise.exposure import ExposureRefinement, fitted_gains, scene_colours
+from pipelines.optimise.exposure import CHANGED, ExposureRefinement, fitted_gains, light_changes, scene_colours
 from pipelines.render.cpu.photometric_model import IDENTITY
 from pipelines.settings import ExposureSettings, MappingSettings
-from tests.pipelines.test_online import CAMERA, frame
-
-pytestmark = pytest.mark.slow
+from tests.pipelines.wall import CAMERA, frame
 
 EXPOSURE = IDENTITY + np.random.default_rng(1).normal(scale=0.05, size=(3, 4))
 
@@ -39,6 +38,7 @@ def vignette(width: int = CAMERA.width, height: int = CAMERA.height) -> NDArray[
 # ---- colours of new Gaussians ----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_colours_of_the_scene_are_those_that_develop_into_the_image() -> None:
     scene = np.random.default_rng(2).uniform(0.3, 0.7, (CAMERA.height, CAMERA.width, 3))
     image = (scene @ EXPOSURE[:, :3].T + EXPOSURE[:, 3]) * vignette()
@@ -48,6 +48,7 @@ def test_the_colours_of_the_scene_are_those_that_develop_into_the_image() -> Non
     assert np.abs(found.reshape(scene.shape) - scene).max() < 0.5 / 255 / vignette().min() * 1.7
 
 
+@pytest.mark.slow
 def test_a_level_of_the_pyramid_finds_its_place_in_the_vignette() -> None:
     view = keyframe(0.6 * vignette(), vignette())
     view.rgba = cv2.resize(view.rgba, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
@@ -55,6 +56,7 @@ def test_a_level_of_the_pyramid_finds_its_place_in_the_vignette() -> None:
     np.testing.assert_allclose(scene_colours(view, corner_and_middle), 0.6, atol=0.005)
 
 
+@pytest.mark.slow
 def test_colours_stay_within_bounds_where_the_exposure_cannot_be_undone() -> None:
     image = np.ones((CAMERA.height, CAMERA.width, 3))
     singular = np.array([[1e-9, 0, 0, 0.5], [0, 1e-9, 0, 0.5], [0, 0, 0, 0.5]])
@@ -66,6 +68,7 @@ def test_colours_stay_within_bounds_where_the_exposure_cannot_be_undone() -> Non
 # ---- the fit and the pull --------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_fit_finds_gains_behind_outliers_and_saturated_pixels() -> None:
     rng = np.random.default_rng(3)
     gains = np.array([1.3, 0.8, 1.1])
@@ -75,12 +78,14 @@ def test_the_fit_finds_gains_behind_outliers_and_saturated_pixels() -> None:
     np.testing.assert_allclose(fitted_gains(colours, image, np.ones(3)), gains, rtol=0.01)
 
 
+@pytest.mark.slow
 def test_a_channel_that_shows_nothing_keeps_its_gain() -> None:
     colours = np.tile([0.5, 0.4, 0.001], (500, 1))
     found = fitted_gains(colours, colours * [1.2, 3.0, 1.0], np.array([0.9, 0.9, 0.7]))
     np.testing.assert_allclose(found, [1.2, 0.9, 0.7])  # green is saturated, blue is dark
 
 
+@pytest.mark.slow
 def test_without_news_from_the_image_the_exposure_returns_to_the_identity() -> None:
     refinement = ExposureRefinement(ExposureSettings(enabled=True, learning_rate=0.01))
     view = keyframe(np.zeros((CAMERA.height, CAMERA.width, 3)), exposure=EXPOSURE)
@@ -89,6 +94,7 @@ def test_without_news_from_the_image_the_exposure_returns_to_the_identity() -> N
     np.testing.assert_allclose(view.exposure, IDENTITY, atol=0.01)
 
 
+@pytest.mark.slow
 def test_a_gradient_that_is_not_finite_moves_nothing() -> None:
     refinement = ExposureRefinement(ExposureSettings(enabled=True))
     view = keyframe(np.zeros((CAMERA.height, CAMERA.width, 3)), exposure=EXPOSURE)
@@ -115,6 +121,7 @@ def keyframes(ids: tuple[int, ...], *exposures: NDArray | None) -> KeyframeStore
     return store
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("ids", "own"), [((0, 0, 2), True), ((0, 0, 0), False), ((0, 1, 2), False)])
 @pytest.mark.parametrize(("enabled", "begins_with"), [(True, IDENTITY), ("auto", None), (False, None)])
 def test_a_keyframe_that_sees_nothing_of_the_map_begins_anew_only_at_a_place_of_its_own(
@@ -124,16 +131,18 @@ def test_a_keyframe_that_sees_nothing_of_the_map_begins_anew_only_at_a_place_of_
     store = keyframes(ids, EXPOSURE, EXPOSURE, EXPOSURE)
     ExposureRefinement(ExposureSettings(enabled=enabled)).begin(store, showing(share=0.0), 0.01)
     np.testing.assert_array_equal(store[-1].exposure, begins_with if own else EXPOSURE)
-    assert store[-1].begins_place == own
+    assert (store[-1].index in store.begins) == own
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("share", "own"), [(0.1, True), (0.5, False)])
 def test_fringes_of_an_earlier_place_are_no_return_to_it(share: float, own: bool) -> None:
     store = keyframes((0, 0, 2), EXPOSURE, EXPOSURE, EXPOSURE)
     ExposureRefinement(ExposureSettings(enabled=True)).begin(store, showing(share), 0.01)
-    assert store[-1].begins_place == own
+    assert (store[-1].index in store.begins) == own
 
 
+@pytest.mark.slow
 def test_exposures_of_a_new_place_are_estimated_once_its_light_changes() -> None:
     """The wall of keyframes 2 to 4 is another place. It begins darker than keyframe 1, but changes only in the last."""
     store = KeyframeStore()
@@ -147,20 +156,21 @@ def test_exposures_of_a_new_place_are_estimated_once_its_light_changes() -> None
             refinement.begin(store, showing(share), 0.01)
         if index == 3:
             assert [view.exposure is None for view in store] == [False, False, True, True]
-    assert [view.begins_place for view in store] == [False, False, True, False, False]
+    assert [view.index in store.begins for view in store] == [False, False, True, False, False]
     for view, exposure in zip(store, [EXPOSURE, EXPOSURE, IDENTITY, IDENTITY], strict=False):
         np.testing.assert_array_equal(view.exposure, exposure)
     gain = np.median(store[-1].rgba[..., :3] / 255.0 / 0.5, axis=(0, 1))
     np.testing.assert_allclose(store[-1].exposure, np.column_stack([np.diag(gain), np.zeros(3)]), atol=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("estimated_there", [True, False])
 def test_back_at_an_earlier_place_exposures_are_estimated_if_they_were_there(estimated_there: bool) -> None:
     """Ten keyframes lie between, and none of them tracks a point of the first or the last."""
     store = keyframes((0, *[1] * 10, 0), EXPOSURE if estimated_there else None, *[None] * 11)
-    store[1].begins_place = True
+    store.begins.add(store[1].index)
     ExposureRefinement(ExposureSettings(enabled="auto")).begin(store, showing(1.0), 0.01)
-    assert [view.begins_place for view in store] == [False, True, *[False] * 10]
+    assert [view.index in store.begins for view in store] == [False, True, *[False] * 10]
     assert [view.exposure is not None for view in store] == [estimated_there] * 12
 
 
@@ -190,6 +200,7 @@ def mapped(frames: list, **exposure: object) -> OnlineMapper:
     return mapper
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("enabled", [True, "auto"])
 def test_the_gains_of_keyframes_are_found(taichi_on_the_cpu: None, enabled: bool | str) -> None:
     mapper = mapped(changing(), enabled=enabled)
@@ -200,9 +211,10 @@ def test_the_gains_of_keyframes_are_found(taichi_on_the_cpu: None, enabled: bool
         np.testing.assert_allclose(shown, 0.5 * gain, atol=0.03)
 
 
+@pytest.mark.slow
 def test_the_exposure_of_the_first_keyframe_of_a_place_is_fixed(taichi_on_the_cpu: None) -> None:
     mapper = mapped(changing(), enabled=True)
-    mapper.keyframes[1].begins_place = True
+    mapper.keyframes.begins.add(mapper.keyframes[1].index)
     before = [view.exposure for view in mapper.keyframes]
     views = list(range(len(before)))
     mapper.optimiser.step(mapper.keyframes, views, mapper.optimiser.rates(mapper.keyframes.scene_depth), pose_rate=0.0)
@@ -211,12 +223,14 @@ def test_the_exposure_of_the_first_keyframe_of_a_place_is_fixed(taichi_on_the_cp
     assert moved == [False, False, *[True] * (len(before) - 2)]
 
 
+@pytest.mark.slow
 def test_no_exposure_is_estimated_in_a_light_that_does_not_change(taichi_on_the_cpu: None) -> None:
     mapper = mapped([frame(i) for i in range(len(GAINS))], enabled="auto")
     assert len(mapper.keyframes) == len(GAINS)
     assert all(view.exposure is None for view in mapper.keyframes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("known", [True, False])
 def test_a_scene_of_one_colour_is_recovered_behind_a_known_vignette(taichi_on_the_cpu: None, known: bool) -> None:
     colour = np.array([0.5, 0.6, 0.4])
@@ -239,3 +253,63 @@ def test_a_scene_of_one_colour_is_recovered_behind_a_known_vignette(taichi_on_th
     # Nobody asked for exposures.
     assert all(view.exposure is None for view in mapper.keyframes)
     assert mapper.keyframes.exposure_at(0) is None
+
+
+def brightened(i: int, gain: float) -> TrackedFrame:
+    f = frame(i)
+    return replace(f, image=np.clip(gain * f.image, 0, 1).astype(np.float32))
+
+
+def store_of(frames: list[TrackedFrame]) -> KeyframeStore:
+    store = KeyframeStore()
+    for each in frames:
+        store.append(each)
+    return store
+
+
+def test_a_wall_in_constant_light_does_not_change() -> None:
+    for last in range(1, 7):
+        assert not light_changes(store_of([frame(i) for i in range(last + 1)]))
+
+
+@pytest.mark.parametrize("gain", [0.5, 0.8, 1.2])
+def test_a_brighter_or_darker_image_is_a_change(gain: float) -> None:
+    assert light_changes(store_of([frame(0), frame(1), brightened(2, gain)]))
+
+
+def test_the_light_of_an_earlier_place_does_not_count() -> None:
+    store = store_of([frame(0), frame(1), brightened(2, 0.5)])
+    store.begins.add(store[2].index)
+    assert not light_changes(store)
+    store.append(brightened(3, 0.5))
+    assert not light_changes(store)
+    store.append(frame(4))
+    assert light_changes(store)
+
+
+def test_a_slow_drift_adds_up_over_several_keyframes() -> None:
+    step = np.exp(0.4 * CHANGED)
+    assert not light_changes(store_of([frame(0), brightened(1, step)]))
+    assert light_changes(store_of([brightened(i, step**i) for i in range(6)]))
+
+
+def test_a_thing_that_hides_a_third_of_the_points_is_no_change() -> None:
+    hidden = frame(1)
+    image = hidden.image.copy()
+    image[:, : CAMERA.width // 3] = 0.9
+    assert not light_changes(store_of([frame(0), replace(hidden, image=image)]))
+
+
+def test_a_vignette_is_no_change_where_it_is_known() -> None:
+    x = np.linspace(-1, 1, CAMERA.width)
+    light = np.repeat(np.repeat((0.75 + 0.25 * x)[None, :, None], CAMERA.height, axis=0), 3, axis=2).astype(np.float32)
+    known = [replace(f, image=f.image * light, vignette=light) for f in (frame(0), frame(6))]
+    assert not light_changes(store_of(known))
+
+
+def test_too_few_points_say_nothing() -> None:
+    def few(f: TrackedFrame) -> TrackedFrame:
+        p = f.points
+        return replace(f, points=replace(p, xyz=p.xyz[:10], pixels=p.pixels[:10], ids=p.ids[:10]))
+
+    assert not light_changes(store_of([few(frame(0)), few(brightened(1, 0.5))]))

@@ -1,21 +1,24 @@
-"""DepthCov's regression against its formulas in plain NumPy, and what holds for any image and any call."""
+"""DepthCov: its depth, its network and its checkpoint."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from scipy.ndimage import map_coordinates
+from torch.nn import functional
 
 from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from fields.map.keyframe import Keyframe
 from fields.map.keyframes import KeyframeStore
 from pipelines.densify.depth import DepthCov, load_depthcov
-from pipelines.densify.depth.depthcov import DepthCovWeights
+from pipelines.densify.depth.depthcov import DepthCovWeights, pixel_covariances
 from pipelines.settings import DepthSettings
+from pipelines.torch_checkpoint import read_checkpoint, require_entries
 
 
 def view(pixels: np.ndarray, depth: np.ndarray, width: int = 96, height: int = 64) -> Keyframe:
@@ -121,3 +124,194 @@ def test_an_estimate_comes_back_bit_for_bit(weights: DepthCovWeights, points: tu
 def test_without_points_nothing_is_known(weights: DepthCovWeights) -> None:
     estimate = estimator(weights).estimate(view(np.zeros((0, 2)), np.zeros(0)), [], ASKED)
     assert np.isinf(estimate.deviation).all()
+
+
+Entries = dict[str, torch.Tensor]
+
+
+def test_the_made_checkpoint_is_as_large_as_the_published_one(published: Entries) -> None:
+    network = [value for name, value in published.items() if name.startswith("gaussian_cov_net.")]
+    assert len(published) == 122
+    assert len(network) == 106
+    assert sum(value.numel() for value in network) == 9_003_020
+
+
+def test_every_weight_comes_to_its_place(checkpoint: Path, published: Entries) -> None:
+    weights = load_depthcov(checkpoint)
+    loaded = weights.network.state_dict()
+    assert len(loaded) == 106
+    for name, value in loaded.items():
+        torch.testing.assert_close(value, published[f"gaussian_cov_net.{name}"], rtol=0, atol=0)
+    assert weights.log_scale == pytest.approx(-1.25)  # of the finest level, index 3
+    assert weights.log_noise == pytest.approx(-2.5)
+
+
+def damaged(name: str, value: torch.Tensor | None) -> Callable[[Entries], Entries]:
+    def change(entries: Entries) -> Entries:
+        entries = {**entries, name: value}
+        return {key: v for key, v in entries.items() if v is not None}
+
+    return change
+
+
+WEIGHT = "gaussian_cov_net.up_convs.3.conv_block.conv2.weight"
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (damaged(WEIGHT, None), f"entry `{WEIGHT}` is missing"),
+        (damaged(WEIGHT, torch.zeros(128, 256, 3, 3)), rf"`{WEIGHT}` has shape \(128, 256, 3, 3\).*\(128, 128, 3, 3\)"),
+        (damaged(WEIGHT, torch.full((128, 128, 3, 3), torch.nan)), f"entry `{WEIGHT}` holds NaN"),
+        (damaged("gaussian_cov_net.extra.bias", torch.zeros(3)), "entry `gaussian_cov_net.extra.bias` is unexpected"),
+        (damaged("log_depth_var_scales.2", None), "entry `log_depth_var_scales.2` is missing"),
+        (damaged("log_depth_var_scales.2", torch.zeros(2)), r"`log_depth_var_scales.2` has shape \(2,\)"),
+        (damaged("cross_cov_modules.1.scale_param", torch.tensor(0.5)), "`cross_cov_modules.1.scale_param` is 0.5"),
+    ],
+)
+def test_damage_is_refused_with_the_entry_s_name(
+    published: Entries, tmp_path: Path, change: Callable[[Entries], Entries], said: str
+) -> None:
+    path = tmp_path / "damaged.ckpt"
+    torch.save({"state_dict": change(published)}, path)
+    with pytest.raises(ValueError, match=said) as caught:
+        load_depthcov(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_numbers_may_be_written_with_an_axis(published: Entries, tmp_path: Path) -> None:
+    scalars = {name: value[None] if value.ndim == 0 else value for name, value in published.items()}
+    torch.save({"state_dict": scalars}, tmp_path / "axis.ckpt")
+    assert load_depthcov(tmp_path / "axis.ckpt").log_scale == pytest.approx(-1.25)
+
+
+def group_norm(x: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor) -> torch.Tensor:
+    _, c, h, w = x.shape
+    groups = x.reshape(16, c // 16 * h * w)
+    groups = (groups - groups.mean(1, keepdim=True)) / (groups.var(1, unbiased=False, keepdim=True) + 1e-5).sqrt()
+    return groups.reshape(x.shape) * weight[:, None, None] + bias[:, None, None]
+
+
+def leaky(x: torch.Tensor) -> torch.Tensor:
+    return torch.where(x > 0, x, 0.01 * x)
+
+
+def block(net: Entries, name: str, x: torch.Tensor) -> torch.Tensor:
+    def conv(which: str, x: torch.Tensor, padding: int) -> torch.Tensor:
+        return functional.conv2d(x, net[f"{name}.{which}.weight"], net[f"{name}.{which}.bias"], padding=padding)
+
+    norm = net[f"{name}.norm.weight"], net[f"{name}.norm.bias"]
+    y = leaky(group_norm(conv("conv1", x, 1), *norm))
+    y = group_norm(conv("conv2", y, 1), *norm)
+    return leaky(conv("conv3", x, 0) + y)
+
+
+def twice(x: torch.Tensor, dim: int) -> torch.Tensor:
+    """Bilinear doubling along one axis: the new pixels lie a quarter pixel beside the old ones."""
+    n = x.shape[dim]
+    before = torch.cat([x.narrow(dim, 0, 1), x.narrow(dim, 0, n - 1)], dim)
+    after = torch.cat([x.narrow(dim, 1, n - 1), x.narrow(dim, n - 1, 1)], dim)
+    return torch.stack([0.75 * x + 0.25 * before, 0.75 * x + 0.25 * after], dim + 1).flatten(dim, dim + 1)
+
+
+def plain_network(published: Entries, image: torch.Tensor) -> torch.Tensor:
+    net = {name.removeprefix("gaussian_cov_net."): value.double() for name, value in published.items()}
+    mean, std = torch.tensor([[0.485, 0.456, 0.406], [0.229, 0.224, 0.225]], dtype=torch.float64)[..., None, None]
+    levels = [block(net, "base", (image.double() - mean) / std)]
+    for i in range(5):
+        x = levels[-1]
+        x = x.unfold(2, 2, 2).unfold(3, 2, 2).amax((-1, -2))
+        levels.append(block(net, f"down_convs.{i}.conv_block", x))
+    x = levels.pop()
+    for i in (4, 3, 2, 1, 0):
+        x = twice(twice(x, 2), 3)
+        x = functional.conv2d(
+            x, net[f"up_convs.{i}.upsample.1.weight"], net[f"up_convs.{i}.upsample.1.bias"], padding=1
+        )
+        x = block(net, f"up_convs.{i}.conv_block", torch.cat([x, levels[i]], 1))
+    return functional.conv2d(x, net["feature_convs.0.weight"], net["feature_convs.0.bias"])
+
+
+def test_the_network_is_the_one_described(checkpoint: Path, published: Entries) -> None:
+    image = torch.rand(1, 3, 64, 96, generator=torch.Generator().manual_seed(1))
+    with torch.inference_mode():
+        raw = load_depthcov(checkpoint).network(image)
+    expected = plain_network(published, image)
+    assert raw.shape == (1, 3, 64, 96)
+    assert expected.std(dim=(2, 3)).min() > 0.1  # it says something of the image
+    torch.testing.assert_close(raw.double(), expected, rtol=1e-3, atol=1e-3)
+
+
+def test_covariances_are_positive_definite_and_within_their_bounds() -> None:
+    raw = torch.tensor([[-50.0, 50.0, 0.0, 3.0, -50.0], [-50.0, -50.0, 1.0, 3.0, -50.0], [0.0, 9.0, 0.5, -9.0, 9.0]])
+    rr, rc, cc = pixel_covariances(raw[None, :, None])[0, :, 0]
+    torch.testing.assert_close(rr, torch.tensor([1e-3, 1e4, 1.0, 3.0, 1e-3]).where(raw[0] != 3, raw[0].exp()))
+    torch.testing.assert_close(cc, torch.tensor([1e-3, 1e-3, 1.0, 3.0, 1e-3]).where(raw[1].abs() > 5, raw[1].exp()))
+    correlation = rc / torch.sqrt(rr * cc - 1e-8)
+    torch.testing.assert_close(correlation, 0.99 * torch.tanh(raw[2]))
+    assert (rr * cc - rc**2 > 0).all()
+
+
+class Harmful:
+    """Unpickling this runs a command."""
+
+    def __init__(self, target: Path) -> None:
+        self.target = target
+
+    def __reduce__(self) -> tuple[object, tuple[str]]:
+        return (type(self.target).touch, (self.target,))
+
+
+def test_pickled_code_is_not_run(tmp_path: Path) -> None:
+    path, target = tmp_path / "harmful.pth", tmp_path / "touched"
+    torch.save({"weight": torch.zeros(2), "more": Harmful(target)}, path)
+    with pytest.raises(ValueError, match="cannot be loaded as weights only") as caught:
+        read_checkpoint(path)
+    assert "\n" not in str(caught.value)
+    assert not target.exists()
+    torch.load(path, weights_only=False)
+    assert target.exists()  # it would have
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ([torch.zeros(1)], "holds list, not tensors by name"),
+        ({"epoch": 3, "weight": torch.zeros(1)}, "entry `epoch` is int, not a tensor"),
+        ({"weight": torch.tensor([torch.inf])}, "entry `weight` holds NaN or infinite"),
+    ],
+)
+def test_anything_but_finite_tensors_by_name_is_refused(tmp_path: Path, content: object, said: str) -> None:
+    torch.save(content, tmp_path / "w.pth")
+    with pytest.raises(ValueError, match=said):
+        read_checkpoint(tmp_path / "w.pth")
+
+
+def test_a_file_that_is_none_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="no such file"):
+        read_checkpoint(tmp_path / "w.pth")
+    (tmp_path / "w.pth").write_bytes(b"not a file of torch")
+    with pytest.raises(ValueError, match=r"w\.pth: cannot be loaded"):
+        read_checkpoint(tmp_path / "w.pth")
+    torch.save({"model": {}}, tmp_path / "w.pth")
+    with pytest.raises(ValueError, match="has no entry `state_dict`"):
+        read_checkpoint(tmp_path / "w.pth", "state_dict")
+
+
+def test_entries_come_as_float32_in_either_of_torch_s_formats(tmp_path: Path) -> None:
+    for zipped in (True, False):
+        path = tmp_path / f"{zipped}.pth"
+        torch.save({"w": torch.arange(4, dtype=torch.float64)}, path, _use_new_zipfile_serialization=zipped)
+        torch.testing.assert_close(read_checkpoint(path)["w"], torch.arange(4, dtype=torch.float32))
+
+
+def test_the_first_wrong_entry_is_named(tmp_path: Path) -> None:
+    entries = {"a": torch.zeros(2, 3), "b": torch.zeros(4)}
+    require_entries(tmp_path, entries, {"a": (2, 3), "b": (4,)})
+    with pytest.raises(ValueError, match="`c` is missing"):
+        require_entries(tmp_path, entries, {"a": (2, 3), "c": (4,)})
+    with pytest.raises(ValueError, match=r"`a` has shape \(2, 3\), it must have \(3, 2\)"):
+        require_entries(tmp_path, entries, {"a": (3, 2), "b": (4,)})
+    with pytest.raises(ValueError, match="`b` is unexpected"):
+        require_entries(tmp_path, entries, {"a": (2, 3)})
