@@ -141,7 +141,7 @@ class Paging(Companion):
         missing = np.fromiter((self.away.missing[view.index] for view in store), np.int64, len(store))
         places = np.flatnonzero(missing <= self.most_missing)
         if (missing.any() or store.begins) and len(places) and store.latest >= 0:
-            centres = centres_of([store[place] for place in places])
+            centres = centres_of([store[place] for place in places.tolist()])
             places = places[~store.far(centres, [store[store.latest]])]
         return places
 

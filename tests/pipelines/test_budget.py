@@ -23,6 +23,8 @@ from pipelines.render.renderer import Renderer
 from pipelines.settings import MappingSettings
 from tests.pipelines.wall import frame
 
+pytestmark = pytest.mark.slow
+
 FRAMES = 6
 VIEWS = MappingSettings().views
 
@@ -66,7 +68,6 @@ def free(taichi_on_the_cpu: None) -> Mapped:
     return mapped(None)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("sh_degree", [0, 2])
 @pytest.mark.parametrize("real", [ti.f32, ti.f64])
 def test_a_gaussian_takes_what_its_fields_hold(taichi_on_the_cpu: None, sh_degree: int, real: object) -> None:
@@ -80,12 +81,10 @@ def test_a_gaussian_takes_what_its_fields_hold(taichi_on_the_cpu: None, sh_degre
     assert gaussians.bytes_each == 4 * values + 4 * 4 + 4 + 2 * 6 * np.dtype(gaussians.dtype).itemsize
 
 
-@pytest.mark.slow
 def test_the_budget_adds_up_what_the_map_holds(free: Mapped) -> None:
     assert free.held == free.counted
 
 
-@pytest.mark.slow
 def test_nothing_is_refused_without_a_limit_or_below_it(free: Mapped) -> None:
     assert free.safeguards.warning() is None
     roomy = mapped(free.held / 1e9 * 1.5)
@@ -94,7 +93,6 @@ def test_nothing_is_refused_without_a_limit_or_below_it(free: Mapped) -> None:
         np.testing.assert_array_equal(roomy.gaussians[name], array)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.3, 0.7])
 def test_a_map_ends_within_its_memory_and_says_what_had_no_room(free: Mapped, share: float) -> None:
     limit = share * free.held
@@ -105,7 +103,6 @@ def test_a_map_ends_within_its_memory_and_says_what_had_no_room(free: Mapped, sh
     assert len(tight.keyframes) + tight.safeguards.keyframes_without_room == FRAMES
 
 
-@pytest.mark.slow
 def test_frames_without_room_go_on_optimising_the_map(free: Mapped) -> None:
     memory = 0.7 * free.held / 1e9
     tight = mapped(memory)
@@ -115,7 +112,6 @@ def test_frames_without_room_go_on_optimising_the_map(free: Mapped) -> None:
     assert tight.renders - mapped(memory, kept).renders == (FRAMES - kept) * VIEWS.per_step
 
 
-@pytest.mark.slow
 def test_a_frame_without_room_is_no_keyframe(free: Mapped) -> None:
     # Without a Gaussian two frames fit, and a third does not.
     tight = mapped(2.5 * (64 * 48 * 4 + 120 * (24 + 16 + 8)) / 1e9)
@@ -123,7 +119,6 @@ def test_a_frame_without_room_is_no_keyframe(free: Mapped) -> None:
     assert tight.safeguards.keyframes_without_room == FRAMES - len(tight.keyframes)
 
 
-@pytest.mark.slow
 def test_frames_between_keyframes_leave_half_of_the_memory_to_the_map(free: Mapped) -> None:
     taken = []
     for memory in (None, free.held / 1e9, free.held / 4e9):
@@ -170,7 +165,6 @@ def keyframe(rng: np.random.Generator) -> KeyframeStore:
     return store
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(engine().max_gaussians < COUNT, reason=f"{engine().title} holds fewer Gaussians")
 def test_three_million_gaussians_are_filled_optimised_saved_and_read_back_without_a_wrong_entry(tmp_path: Path) -> None:
     gaussians = GaussianField(3, COUNT)

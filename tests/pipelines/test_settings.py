@@ -39,7 +39,7 @@ def test_values_out_of_bounds_are_errors(section: type[BaseModel], key: str, val
 
 
 def test_settings_do_not_change_under_way() -> None:
-    with pytest.raises(ValidationError, match="frozen"):
+    with pytest.raises(ValidationError, match="near"):
         MappingSettings().near = 1.0
 
 
@@ -49,5 +49,5 @@ def test_settings_do_not_change_under_way() -> None:
 )
 def test_a_pool_beyond_what_the_engine_holds_is_refused(section: type[StrictModel], most: int) -> None:
     assert section(max_gaussians=most).max_gaussians == most
-    with pytest.raises(ValueError, match=f"{engine().title} holds at most {most:,} Gaussians"):
+    with pytest.raises(ValueError, match=f"{most:,}"):
         section(max_gaussians=most + 1)

@@ -67,5 +67,5 @@ def test_clipping_brings_the_render_into_the_range_of_a_file(images: ImageBuffer
 
 @pytest.mark.parametrize("size", [(41, 20), (40, 21)])
 def test_images_beyond_the_capacity_are_refused(images: ImageBuffers, size: tuple[int, int]) -> None:
-    with pytest.raises(ValueError, match=f"image of {size[0]}x{size[1]} exceeds the buffers made for 40x20"):
+    with pytest.raises(ValueError, match=f"{size[0]}x{size[1]}"):
         images.resize(*size)

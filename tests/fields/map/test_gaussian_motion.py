@@ -131,5 +131,5 @@ def test_gradients_of_what_moves_are_dropped(motion: GaussianMotion, states) -> 
 
 
 def test_an_anchor_without_a_motion_is_refused(motion: GaussianMotion, states) -> None:
-    with pytest.raises(ValueError, match="anchor 3 has none of the 3 motions"):
+    with pytest.raises(ValueError, match="anchor 3"):
         motion.move(S[:3], SH_TURN[:3])

@@ -106,7 +106,7 @@ def test_loading_what_was_saved_changes_nothing(gaussians: GaussianField) -> Non
 def test_a_zero_quaternion_is_refused_with_its_index(gaussians: GaussianField) -> None:
     bad = state(6)
     bad["quaternion"][4] = 0
-    with pytest.raises(ValueError, match="Gaussian 4: quaternion is zero"):
+    with pytest.raises(ValueError, match="Gaussian 4: quaternion"):
         gaussians.append(**bad)
     assert len(gaussians) == 0
 
@@ -116,16 +116,16 @@ def test_a_zero_quaternion_is_refused_with_its_index(gaussians: GaussianField) -
 def test_what_is_not_finite_is_refused_with_its_index(gaussians: GaussianField, name: str, value: float) -> None:
     bad = state(6)
     bad[name][3] = value
-    with pytest.raises(ValueError, match=f"Gaussian 3: {name} is not finite"):
+    with pytest.raises(ValueError, match=f"Gaussian 3: {name}"):
         gaussians.load(bad)
 
 
 def test_shapes_that_disagree_and_a_full_pool_are_refused(gaussians: GaussianField) -> None:
     bad = state(6)
     bad["log_scale"] = bad["log_scale"][:5]
-    with pytest.raises(ValueError, match="log_scale has shape"):
+    with pytest.raises(ValueError, match="log_scale"):
         gaussians.append(**bad)
-    with pytest.raises(ValueError, match="exceed the pool of 524288; raise max_gaussians"):
+    with pytest.raises(ValueError, match="max_gaussians"):
         gaussians.append(**state(524289))
 
 
@@ -149,5 +149,5 @@ def test_more_fields_than_the_engine_holds_are_refused(
     gaussians: GaussianField, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("fields.runtime.backend.MAX_SNODES", gaussians.touched.snode.ptr.id + 1)
-    with pytest.raises(RuntimeError, match="call initialise\\(\\) before making another"):
+    with pytest.raises(RuntimeError, match="initialise"):
         GaussianField(0, max_gaussians=1024)

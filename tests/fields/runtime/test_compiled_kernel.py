@@ -81,7 +81,7 @@ def test_wrong_types_of_the_first_call_are_refused() -> None:
 def test_wrong_types_of_a_later_call_are_refused() -> None:
     add = CompiledKernel(Sums().add)
     add(1, 0.5, np.zeros(4))
-    with pytest.raises(TypeError, match="argument 0 of a kernel is a int64"):
+    with pytest.raises(TypeError, match="argument 0"):
         add(np.int64(1), 0.5, np.zeros(4))
 
 

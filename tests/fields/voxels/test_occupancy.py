@@ -258,7 +258,7 @@ def test_memory_of_places_that_rest_is_used_again(taichi_on_the_cpu: None) -> No
 
 @pytest.mark.parametrize("wrong", [{"levels": 0}, {"levels": 12, "resolution": 512}, {"coarsest": 0.0}])
 def test_impossible_voxels_are_refused(wrong: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match="voxels need"):
+    with pytest.raises(ValueError):
         OccupancyVoxels(**({"coarsest": 1.0} | wrong))
 
 

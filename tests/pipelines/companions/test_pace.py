@@ -55,7 +55,7 @@ def test_recorded_decisions_are_repeated_in_their_order() -> None:
 def test_other_frames_than_the_recorded_ones_are_an_error() -> None:
     pace = RecordedPace(MappingSettings(), [None])
     assert not pace.takes_keyframe()
-    with pytest.raises(ValueError, match="these are other frames"):
+    with pytest.raises(ValueError):
         pace.takes_keyframe()
 
 

@@ -38,5 +38,5 @@ def test_pictures_and_gradients_are_those_of_the_cpu(on_both: Callable) -> None:
 def test_float64_is_refused(on_both: Callable) -> None:
     on_both(lambda: None)
     inputs = [torch.from_numpy(value) for value in random_gaussians(3, seed=4).values()]
-    with pytest.raises(TypeError, match="float64, which the GPU's kernels do not have"):
+    with pytest.raises(TypeError, match="float64"):
         rasterize(*inputs, T_camera_world=torch.eye(4), camera=CAMERA)

@@ -20,6 +20,8 @@ from pipelines.render.cpu.photometric_model import IDENTITY
 from pipelines.settings import ExposureSettings, MappingSettings
 from tests.pipelines.wall import CAMERA, frame
 
+pytestmark = pytest.mark.slow
+
 EXPOSURE = IDENTITY + np.random.default_rng(1).normal(scale=0.05, size=(3, 4))
 
 
@@ -38,7 +40,6 @@ def vignette(width: int = CAMERA.width, height: int = CAMERA.height) -> NDArray[
 # ---- colours of new Gaussians ----------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 def test_the_colours_of_the_scene_are_those_that_develop_into_the_image() -> None:
     scene = np.random.default_rng(2).uniform(0.3, 0.7, (CAMERA.height, CAMERA.width, 3))
     image = (scene @ EXPOSURE[:, :3].T + EXPOSURE[:, 3]) * vignette()
@@ -48,7 +49,6 @@ def test_the_colours_of_the_scene_are_those_that_develop_into_the_image() -> Non
     assert np.abs(found.reshape(scene.shape) - scene).max() < 0.5 / 255 / vignette().min() * 1.7
 
 
-@pytest.mark.slow
 def test_a_level_of_the_pyramid_finds_its_place_in_the_vignette() -> None:
     view = keyframe(0.6 * vignette(), vignette())
     view.rgba = cv2.resize(view.rgba, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
@@ -56,7 +56,6 @@ def test_a_level_of_the_pyramid_finds_its_place_in_the_vignette() -> None:
     np.testing.assert_allclose(scene_colours(view, corner_and_middle), 0.6, atol=0.005)
 
 
-@pytest.mark.slow
 def test_colours_stay_within_bounds_where_the_exposure_cannot_be_undone() -> None:
     image = np.ones((CAMERA.height, CAMERA.width, 3))
     singular = np.array([[1e-9, 0, 0, 0.5], [0, 1e-9, 0, 0.5], [0, 0, 0, 0.5]])
@@ -68,7 +67,6 @@ def test_colours_stay_within_bounds_where_the_exposure_cannot_be_undone() -> Non
 # ---- the fit and the pull --------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 def test_the_fit_finds_gains_behind_outliers_and_saturated_pixels() -> None:
     rng = np.random.default_rng(3)
     gains = np.array([1.3, 0.8, 1.1])
@@ -78,14 +76,12 @@ def test_the_fit_finds_gains_behind_outliers_and_saturated_pixels() -> None:
     np.testing.assert_allclose(fitted_gains(colours, image, np.ones(3)), gains, rtol=0.01)
 
 
-@pytest.mark.slow
 def test_a_channel_that_shows_nothing_keeps_its_gain() -> None:
     colours = np.tile([0.5, 0.4, 0.001], (500, 1))
     found = fitted_gains(colours, colours * [1.2, 3.0, 1.0], np.array([0.9, 0.9, 0.7]))
     np.testing.assert_allclose(found, [1.2, 0.9, 0.7])  # green is saturated, blue is dark
 
 
-@pytest.mark.slow
 def test_without_news_from_the_image_the_exposure_returns_to_the_identity() -> None:
     refinement = ExposureRefinement(ExposureSettings(enabled=True, learning_rate=0.01))
     view = keyframe(np.zeros((CAMERA.height, CAMERA.width, 3)), exposure=EXPOSURE)
@@ -94,7 +90,6 @@ def test_without_news_from_the_image_the_exposure_returns_to_the_identity() -> N
     np.testing.assert_allclose(view.exposure, IDENTITY, atol=0.01)
 
 
-@pytest.mark.slow
 def test_a_gradient_that_is_not_finite_moves_nothing() -> None:
     refinement = ExposureRefinement(ExposureSettings(enabled=True))
     view = keyframe(np.zeros((CAMERA.height, CAMERA.width, 3)), exposure=EXPOSURE)
@@ -121,7 +116,6 @@ def keyframes(ids: tuple[int, ...], *exposures: NDArray | None) -> KeyframeStore
     return store
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("ids", "own"), [((0, 0, 2), True), ((0, 0, 0), False), ((0, 1, 2), False)])
 @pytest.mark.parametrize(("enabled", "begins_with"), [(True, IDENTITY), ("auto", None), (False, None)])
 def test_a_keyframe_that_sees_nothing_of_the_map_begins_anew_only_at_a_place_of_its_own(
@@ -134,7 +128,6 @@ def test_a_keyframe_that_sees_nothing_of_the_map_begins_anew_only_at_a_place_of_
     assert (store[-1].index in store.begins) == own
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("share", "own"), [(0.1, True), (0.5, False)])
 def test_fringes_of_an_earlier_place_are_no_return_to_it(share: float, own: bool) -> None:
     store = keyframes((0, 0, 2), EXPOSURE, EXPOSURE, EXPOSURE)
@@ -142,7 +135,6 @@ def test_fringes_of_an_earlier_place_are_no_return_to_it(share: float, own: bool
     assert (store[-1].index in store.begins) == own
 
 
-@pytest.mark.slow
 def test_exposures_of_a_new_place_are_estimated_once_its_light_changes() -> None:
     """The wall of keyframes 2 to 4 is another place. It begins darker than keyframe 1, but changes only in the last."""
     store = KeyframeStore()
@@ -163,7 +155,6 @@ def test_exposures_of_a_new_place_are_estimated_once_its_light_changes() -> None
     np.testing.assert_allclose(store[-1].exposure, np.column_stack([np.diag(gain), np.zeros(3)]), atol=0.02)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("estimated_there", [True, False])
 def test_back_at_an_earlier_place_exposures_are_estimated_if_they_were_there(estimated_there: bool) -> None:
     """Ten keyframes lie between, and none of them tracks a point of the first or the last."""
@@ -200,7 +191,6 @@ def mapped(frames: list, **exposure: object) -> OnlineMapper:
     return mapper
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("enabled", [True, "auto"])
 def test_the_gains_of_keyframes_are_found(taichi_on_the_cpu: None, enabled: bool | str) -> None:
     mapper = mapped(changing(), enabled=enabled)
@@ -211,7 +201,6 @@ def test_the_gains_of_keyframes_are_found(taichi_on_the_cpu: None, enabled: bool
         np.testing.assert_allclose(shown, 0.5 * gain, atol=0.03)
 
 
-@pytest.mark.slow
 def test_the_exposure_of_the_first_keyframe_of_a_place_is_fixed(taichi_on_the_cpu: None) -> None:
     mapper = mapped(changing(), enabled=True)
     mapper.keyframes.begins.add(mapper.keyframes[1].index)
@@ -223,14 +212,12 @@ def test_the_exposure_of_the_first_keyframe_of_a_place_is_fixed(taichi_on_the_cp
     assert moved == [False, False, *[True] * (len(before) - 2)]
 
 
-@pytest.mark.slow
 def test_no_exposure_is_estimated_in_a_light_that_does_not_change(taichi_on_the_cpu: None) -> None:
     mapper = mapped([frame(i) for i in range(len(GAINS))], enabled="auto")
     assert len(mapper.keyframes) == len(GAINS)
     assert all(view.exposure is None for view in mapper.keyframes)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("known", [True, False])
 def test_a_scene_of_one_colour_is_recovered_behind_a_known_vignette(taichi_on_the_cpu: None, known: bool) -> None:
     colour = np.array([0.5, 0.6, 0.4])

@@ -126,33 +126,33 @@ def test_a_gradient_can_be_taken_again_and_by_parts(scene: dict[str, Tensor]) ->
 
 
 @pytest.mark.parametrize(
-    ("changes", "error", "complaint"),
+    ("changes", "error", "named"),
     [
-        ({"position": np.zeros((60, 3))}, TypeError, "position is a ndarray, expected a torch.Tensor"),
-        ({"sh": torch.zeros(60, 4, 3, dtype=torch.float16)}, TypeError, "sh is float16, expected float32 or float64"),
-        ({"log_scale": torch.zeros(60, 3).double()}, TypeError, "log_scale is float64, position float32"),
-        ({"log_scale": torch.zeros(60, 3, device="meta")}, ValueError, "log_scale lies on meta, the kernels run on"),
-        ({"position": torch.zeros(3)}, ValueError, r"position has shape \(3,\), expected \(3, 3\)"),
-        ({"quaternion": torch.ones(60, 3)}, ValueError, r"quaternion has shape \(60, 3\), expected \(60, 4\)"),
-        ({"opacity_logit": torch.ones(60, 1)}, ValueError, r"opacity_logit has shape \(60, 1\), expected \(60,\)"),
-        ({"sh": torch.ones(60, 5, 3)}, ValueError, r"sh has shape \(60, 5, 3\), expected \(60, K, 3\)"),
-        ({"background": torch.ones(4)}, ValueError, r"background has shape \(4,\), expected \(3,\)"),
-        ({"T_camera_world": torch.eye(3)}, ValueError, r"T_camera_world has shape \(3, 3\), expected \(4, 4\)"),
-        ({"T_camera_world": 1.1 * torch.eye(4)}, ValueError, "T_camera_world is no rigid motion: an entry is 0.1 off"),
-        ({"T_camera_world": -torch.eye(4)}, ValueError, "T_camera_world is no rigid motion"),
-        ({"log_scale": torch.full((60, 3), torch.nan)}, ValueError, "log_scale of Gaussian 0 is not finite"),
-        ({"quaternion": torch.eye(60, 4)}, ValueError, "quaternion of Gaussian 4 is zero"),
-        ({"colour": torch.ones(60, 3)}, TypeError, "either sh or colour"),
-        ({"near": float("nan")}, ValueError, "near is nan"),
-        ({"near": 0.0}, ValueError, "near is 0.0"),
-        ({"near": -1.0}, ValueError, "near is -1.0"),
-        ({"log_scale": torch.eye(60, 3) * 25.0, "position": torch.ones(60, 3)}, ValueError, "log_scale of Gaussian 0"),
+        ({"position": np.zeros((60, 3))}, TypeError, "position"),
+        ({"sh": torch.zeros(60, 4, 3, dtype=torch.float16)}, TypeError, "sh"),
+        ({"log_scale": torch.zeros(60, 3).double()}, TypeError, "log_scale"),
+        ({"log_scale": torch.zeros(60, 3, device="meta")}, ValueError, "log_scale"),
+        ({"position": torch.zeros(3)}, ValueError, "position"),
+        ({"quaternion": torch.ones(60, 3)}, ValueError, "quaternion"),
+        ({"opacity_logit": torch.ones(60, 1)}, ValueError, "opacity_logit"),
+        ({"sh": torch.ones(60, 5, 3)}, ValueError, "sh"),
+        ({"background": torch.ones(4)}, ValueError, "background"),
+        ({"T_camera_world": torch.eye(3)}, ValueError, "T_camera_world"),
+        ({"T_camera_world": 1.1 * torch.eye(4)}, ValueError, "T_camera_world"),
+        ({"T_camera_world": -torch.eye(4)}, ValueError, "T_camera_world"),
+        ({"log_scale": torch.full((60, 3), torch.nan)}, ValueError, "log_scale"),
+        ({"quaternion": torch.eye(60, 4)}, ValueError, "quaternion"),
+        ({"colour": torch.ones(60, 3)}, TypeError, "colour"),
+        ({"near": float("nan")}, ValueError, "near"),
+        ({"near": 0.0}, ValueError, "near"),
+        ({"near": -1.0}, ValueError, "near"),
+        ({"log_scale": torch.eye(60, 3) * 25.0, "position": torch.ones(60, 3)}, ValueError, "log_scale"),
     ],
 )
-def test_what_does_not_fit_is_told_in_one_line(
-    scene: dict[str, Tensor], changes: dict[str, object], error: type[Exception], complaint: str
+def test_what_does_not_fit_is_named_in_one_line(
+    scene: dict[str, Tensor], changes: dict[str, object], error: type[Exception], named: str
 ) -> None:
-    with pytest.raises(error, match=complaint) as told:
+    with pytest.raises(error, match=rf"\b{named}\b") as told:
         rasterize(**{**scene, "T_camera_world": torch.eye(4), "camera": CAMERA, **changes})
     assert "\n" not in str(told.value)
 

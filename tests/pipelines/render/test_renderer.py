@@ -199,5 +199,5 @@ def test_the_length_of_a_quaternion_does_not_matter(renderer: Renderer) -> None:
 
 
 def test_an_image_beyond_the_buffers_is_refused(renderer: Renderer) -> None:
-    with pytest.raises(ValueError, match="65x64 exceeds the buffers made for 64x64"):
+    with pytest.raises(ValueError, match="65x64"):
         renderer.forward(PinholeCamera(50.0, 50.0, 32.0, 32.0, 65, 64), np.eye(4), NEAR)

@@ -19,6 +19,8 @@ from tests.pipelines.differences import STEP, central_differences
 from tests.pipelines.render.cpu.exp2_kernels import powers
 from tests.pipelines.scenes import CAMERA, NEAR, POSE, random_gaussians
 
+pytestmark = pytest.mark.slow
+
 Lists = dict[int, list[tuple[int, int, int]]]
 
 
@@ -115,7 +117,6 @@ def pictures(renderer: Renderer, exposure: NDArray | None, vignette: NDArray | N
     return rendered, renderer.images.colour_to_numpy()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("exposure", [None, EXPOSURE])
 @pytest.mark.parametrize("vignette", [None, VIGNETTE])
 def test_the_picture_is_developed_by_the_formula(
@@ -131,7 +132,6 @@ def test_the_picture_is_developed_by_the_formula(
     np.testing.assert_allclose(developed, expected, atol=2e-6)
 
 
-@pytest.mark.slow
 def test_a_vignette_is_resized_to_the_level_that_is_rendered(renderer: Renderer) -> None:
     renderer.gaussians.load(random_gaussians(30, seed=4))
     large = np.random.default_rng(5).uniform(0.2, 1.0, (48, 64, 3)).astype(np.float32)
@@ -169,7 +169,6 @@ def functional(renderers: Callable[..., Renderer]) -> Functional:
 STATE = random_gaussians(5, seed=3, size=(14.0, 25.0), logit=(0.0, 1.5), beyond=-0.2)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["sh", "opacity_logit", "position"])
 def test_the_gradients_of_the_gaussians_are_those_of_finite_differences(functional: Functional, name: str) -> None:
     functional.backward(STATE)
@@ -179,7 +178,6 @@ def test_the_gradients_of_the_gaussians_are_those_of_finite_differences(function
     assert np.abs(analytic - numeric).max() / np.abs(numeric).max() < 1e-4
 
 
-@pytest.mark.slow
 def test_the_gradient_of_the_exposure_is_that_of_finite_differences(functional: Functional) -> None:
     functional.backward(STATE)
     analytic = functional.renderer.exposure_gradient()
@@ -192,7 +190,6 @@ def test_the_gradient_of_the_exposure_is_that_of_finite_differences(functional: 
     assert np.abs(analytic - numeric).max() / np.abs(numeric).max() < 1e-6
 
 
-@pytest.mark.slow
 def test_a_developed_picture_leaves_nothing_behind_for_the_next(renderer: Renderer) -> None:
     """Gradients of a picture that is not developed, before and after one that is."""
     state = random_gaussians(30, seed=4)
@@ -210,7 +207,6 @@ def test_a_developed_picture_leaves_nothing_behind_for_the_next(renderer: Render
     np.testing.assert_array_equal(gradients(None, None), before)
 
 
-@pytest.mark.slow
 def test_the_sums_of_the_exposure_gradient_are_bit_identical(renderer: Renderer) -> None:
     renderer.gaussians.load(random_gaussians(30, seed=4))
     weights = np.random.default_rng(8).normal(size=SHAPE)
