@@ -25,7 +25,8 @@ from pipelines.companions.transients import TransientSweep
 from pipelines.corrections import CorrectionReport, MapCorrector
 from pipelines.densify.contribution import Contribution
 from pipelines.densify.densifier import Densifier
-from pipelines.densify.depth import DepthEstimator, build_depth
+from pipelines.densify.depth.estimate import DepthEstimator
+from pipelines.densify.depth.sources import build_depth
 from pipelines.optimise.map_optimiser import MapOptimiser
 from pipelines.optimise.safeguards import Safeguards
 from pipelines.pipeline import FrameReport, Pipeline

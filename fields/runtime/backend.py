@@ -15,8 +15,8 @@ import torch
 from fields.runtime.device_check import computes_rightly
 from fields.runtime.engine import configuration, engine, forget_arrays, lock, running_program, start, ti
 from fields.runtime.kernel_sources import answer_quickly
+from fields.runtime.process import pin_workers, threads_of_process
 from fields.runtime.vulkan_devices import VulkanDevice, choose, vulkan_devices
-from fields.runtime.workers import pin_workers, threads_of_process
 
 __all__ = [
     "describe",

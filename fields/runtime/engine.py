@@ -23,7 +23,7 @@ from importlib.util import find_spec
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from fields.runtime import surroundings
+from fields.runtime import process
 
 if TYPE_CHECKING:
     import taichi as ti  # noqa: TID251 (this is the one place)
@@ -204,18 +204,18 @@ def engine() -> Engine:
 @functools.cache
 def _load() -> ModuleType:
     chosen = engine()
-    if (narrow := surroundings.why_too_narrow()) is not None:
+    if (narrow := process.why_too_narrow()) is not None:
         raise EngineError(narrow)
     for name, value in chosen.switches.items():
         os.environ.setdefault(name, value)
-    surroundings.provide_cache(chosen.package)
+    process.provide_cache(chosen.package)
     try:
         module = importlib.import_module(chosen.package)
     except ImportError as error:
         raise EngineError(
             f"{chosen.title} cannot be loaded ({error}): install it anew, or set {VARIABLE} to another"
         ) from error
-    if chosen.saves_cache_on_reset or surroundings.notes:  # a temporary cache is removed after that
+    if chosen.saves_cache_on_reset or process.notes:  # a temporary cache is removed after that
         atexit.register(module.reset)
     if chosen.slow_attributes:
         vars(module)["data_oriented"] = _data_oriented

@@ -18,7 +18,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from fields.runtime.engine import EngineError
-from fields.runtime.surroundings import why_too_narrow
+from fields.runtime.process import why_too_narrow
 from modp_ti.config.presets import PRESETS
 from modp_ti.files.ending_signals import EndingSignals, exit_code
 from modp_ti.files.errors import InputError

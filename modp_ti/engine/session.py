@@ -15,7 +15,7 @@ from rich.console import Console
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.camera import PinholeCamera
-from fields.runtime import surroundings
+from fields.runtime import process
 from fields.runtime.backend import describe, initialise
 from modp_ti.config.settings import SceneConfig
 from modp_ti.engine.build import EXPECTED, build_mapper, open_conductor, open_earlier_map, open_observer
@@ -116,7 +116,7 @@ class _Session:
             raise InputError(str(error)) from None
         self.record.device = describe(self.backend)
         self.line.note(f"device: {self.record.device}")
-        self._say(*surroundings.notes)
+        self._say(*process.notes)
         self.compiling = 0.0  # [s]; 0 until the mapper is made
         # Set while the stream is opened.
         self.tracker: Tracker

@@ -17,8 +17,7 @@ from typing import IO
 import numpy as np
 from numpy.typing import NDArray
 
-from fields.runtime.disk_room import has_room
-from fields.runtime.heap import give_back_pages
+from fields.runtime.process import give_back_pages, has_room
 
 __all__ = ["BlockError", "BlockFiles", "StoredBlock", "records_of", "state_of"]
 

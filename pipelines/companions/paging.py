@@ -13,7 +13,7 @@ from fields.map.blocks import Blocks, Boxes, divide, extent_of, seen
 from fields.map.gaussians import GaussianField
 from fields.map.keyframe import Keyframe
 from fields.map.keyframes import KeyframeStore, centres_of
-from fields.runtime.heap import give_back_heap
+from fields.runtime.process import give_back_heap
 from pipelines.companions.away import CHUNK, BlocksOnDisk, planes_of_views
 from pipelines.companions.companion import Companion
 from pipelines.memory_budget import OBSERVATION, MemoryBudget

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from fields.map.keyframe import Keyframe
 from fields.map.keyframes import KeyframeStore
 from fields.voxels.occupancy import OccupancyVoxels
-from pipelines.densify.depth import DepthEstimator
+from pipelines.densify.depth.estimate import DepthEstimator
 from pipelines.densify.growth import Seeds, dissimilarity, error_pixels, grow, pixel_seeds, tracked_seeds
 from pipelines.memory_budget import MemoryBudget
 from pipelines.optimise.map_optimiser import MapOptimiser

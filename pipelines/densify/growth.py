@@ -13,8 +13,7 @@ from fields.geometry.se3 import inverse_se3
 from fields.map.gaussians import NO_ANCHOR, SH_C0, GaussianField
 from fields.map.keyframe import Keyframe
 from fields.voxels.occupancy import OccupancyVoxels
-from pipelines.densify.depth import DepthEstimator
-from pipelines.densify.depth.estimate import misplacement
+from pipelines.densify.depth.estimate import DepthEstimator, misplacement
 from pipelines.memory_budget import MemoryBudget
 from pipelines.optimise.exposure import scene_colours
 from pipelines.settings import DensifySettings

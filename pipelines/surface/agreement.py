@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from fields.geometry.camera import PinholeCamera
 from fields.runtime.engine import ti
-from pipelines.densify.depth.plane_sweep import plane_warp
+from pipelines.densify.depth.epipolar import plane_warp
 from pipelines.surface.plane_sweep import LANES
 
 __all__ = ["agreeing_views"]

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import inverse_se3
-from pipelines.densify.depth.plane_sweep import plane_warp
+from pipelines.densify.depth.epipolar import plane_warp
 from pipelines.surface.plane_sweep import PlaneSweep
 
 __all__ = ["DepthMatcher", "DepthView", "choose_neighbours"]

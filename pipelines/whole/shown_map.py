@@ -11,7 +11,7 @@ from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import inverse_se3
 from fields.map.blocks import Blocks, divide, extent_of, planes_of, seen
 from fields.map.gaussians import GaussianField
-from fields.runtime.heap import give_back_heap, give_back_pages
+from fields.runtime.process import give_back_heap, give_back_pages
 from pipelines.whole.hierarchy import Hierarchy, side_of
 
 __all__ = ["ShownMap"]

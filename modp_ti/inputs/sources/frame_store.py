@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from fields.runtime.disk_room import has_room
+from fields.runtime.process import has_room
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.sources.image_header import read_image_header
 from modp_ti.inputs.sources.image_pixels import decoded

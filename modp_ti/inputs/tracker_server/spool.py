@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.frames.tracked_frame import SparsePoints
-from fields.runtime.disk_room import has_room
+from fields.runtime.process import has_room
 from modp_ti.config.settings import SourceSettings
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.sources import FrameReader

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.frames.origin import NO_ORIGIN
-from fields.runtime.heap import give_back_pages
+from fields.runtime.process import give_back_pages
 from modp_ti.files import read_bytes
 from modp_ti.files.atomic import replacing
 from modp_ti.files.errors import InputError

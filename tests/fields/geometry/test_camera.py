@@ -1,7 +1,5 @@
 """The camera model, the metric of its pixels, and vectors in kernels."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

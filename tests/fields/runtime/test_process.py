@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 import torch
 
-from fields.runtime import heap
+from fields.runtime import process
 from fields.runtime.async_readback import AsyncReadback
 from fields.runtime.engine import engine
-from fields.runtime.surroundings import NEEDED, why_too_narrow
+from fields.runtime.process import NEEDED, why_too_narrow
 from fields.runtime.vulkan_devices import VulkanDevice, choose, vulkan_devices
 from tests.patience import PATIENCE
 
@@ -25,7 +25,7 @@ from tests.patience import PATIENCE
 PROGRAM = """
 import os
 import numpy as np
-from fields.runtime.heap import give_back_heap
+from fields.runtime.process import give_back_heap
 
 def resident():
     with open("/proc/self/statm", encoding="ascii") as file:
@@ -49,15 +49,15 @@ def test_what_lies_below_something_that_stays_is_given_back() -> None:
 
 
 def test_without_such_a_c_library_nothing_happens(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(heap.ctypes, "CDLL", lambda _: object())
-    heap.give_back_heap()
+    monkeypatch.setattr(process.ctypes, "CDLL", lambda _: object())
+    process.give_back_heap()
 
 
 # 8 MB of a file, all of which are read.
 MAPPED = """
 import mmap, os, sys
 import numpy as np
-from fields.runtime.heap import give_back_pages
+from fields.runtime.process import give_back_pages
 
 def resident():
     with open("/proc/self/statm", encoding="ascii") as file:
@@ -83,7 +83,7 @@ def test_what_was_read_of_a_mapped_file_is_given_back_and_can_be_read_again(tmp_
 
 def test_an_array_in_memory_stays_as_it_is() -> None:
     array = np.arange(100_000)
-    heap.give_back_pages(array[10:])
+    process.give_back_pages(array[10:])
     assert array.tolist() == list(range(100_000))
 
 
@@ -114,7 +114,7 @@ def test_a_narrow_address_space_is_told_in_one_line(monkeypatch: pytest.MonkeyPa
 ROOT = Path(__file__).resolve().parents[3]
 STARTS = """
 import os, sys
-from fields.runtime.workers import threads_of_process
+from fields.runtime.process import threads_of_process
 before = threads_of_process()
 from fields.runtime.backend import initialise
 initialise("cpu", int(sys.argv[1]) or None)

@@ -12,7 +12,7 @@ from plyfile import PlyData
 
 from fields.frames.pose_correction import PoseCorrection
 from fields.map.keyframes import KeyframeStore
-from fields.runtime import disk_room
+from fields.runtime import process
 from fields.runtime.backend import initialise
 from fields.voxels.occupancy import OccupancyVoxels
 from modp_ti.outputs.formats.splats_ply import write_splats
@@ -183,7 +183,7 @@ def test_the_whole_map_is_what_lies_here_and_on_disk(
     files = {path.name for path in tmp_path.rglob("*.*")}
     mapped = mapper.all_gaussians()
     assert {path.name for path in tmp_path.rglob("*.*")} == files, "its file is gone when nobody needs the arrays"
-    monkeypatch.setattr(disk_room, "KEPT_FREE", 1 << 62)
+    monkeypatch.setattr(process, "KEPT_FREE", 1 << 62)
     in_memory = mapper.all_gaussians()
     for name, array in mapped.items():
         assert not array.flags.owndata and in_memory[name].flags.owndata
@@ -207,7 +207,7 @@ def test_a_damaged_block_is_named_and_the_map_goes_on_without_it(taichi_on_the_c
 def test_a_full_disk_is_told_and_leaves_out_what_has_no_room(
     taichi_on_the_cpu: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(disk_room, "KEPT_FREE", 1 << 60)
+    monkeypatch.setattr(process, "KEPT_FREE", 1 << 60)
     mapper = walk(mapper_of(max_gaussians=2048), end=10)
     assert mapper.paging.problem == "blocks of the map cannot be kept on disk: No space left on device"
     assert len(mapper.paging.away) == 0 and len(mapper.gaussians) <= 2048
@@ -224,7 +224,7 @@ def test_hidden_gaussians_on_a_full_disk_stay_where_they_are(
     young, count = int(np.median(anchors)), len(anchors)
     spared = np.arange(anchors.max() + 1) >= young
     with monkeypatch.context() as full:
-        full.setattr(disk_room, "KEPT_FREE", 1 << 60)
+        full.setattr(process, "KEPT_FREE", 1 << 60)
         away.remove_hidden(1.0, spared)  # nothing has been measured: all but the young are hidden
     assert int(away.counts.sum()) == count
     away.remove_hidden(1.0, spared)

@@ -15,8 +15,7 @@ from fields.map.gaussians import SH_C0, GaussianField
 from fields.map.keyframe import Keyframe
 from fields.map.keyframes import KeyframeStore
 from fields.voxels.occupancy import OccupancyVoxels
-from pipelines.densify.depth import DepthEstimate
-from pipelines.densify.depth.estimate import misplacement
+from pipelines.densify.depth.estimate import DepthEstimate, misplacement
 from pipelines.densify.growth import Seeds, dissimilarity, error_pixels, grow, pixel_seeds, tracked_seeds
 from pipelines.densify.point_initialisation import PointCloud, initialise, spacing, union_of_points
 from pipelines.memory_budget import MemoryBudget
@@ -227,7 +226,7 @@ SMALL = PinholeCamera(20.0, 20.0, 8.0, 6.0, 16, 12)
 
 
 def placed(index: int, ids: list[int], pixels: list[tuple[float, float]], xyz: np.ndarray, red: float) -> Keyframe:
-    """A placed of one colour; its pixel in row 0, column 0 is masked."""
+    """A view of one colour; its pixel in row 0, column 0 is masked."""
     image = np.tile(np.array([red, 0.2, 0.8], dtype=np.float32), (12, 16, 1))
     mask = np.ones((12, 16), dtype=bool)
     mask[0, 0] = False
@@ -239,7 +238,7 @@ def test_every_tracked_point_counts_once_as_the_last_view_that_shows_it_has_it()
     first = placed(0, [7, 3, 5, 9], [(4, 4), (5, 5), (6, 6), (0.5, 0.5)], np.arange(12.0).reshape(4, 3), 0.2)
     second = placed(1, [5, 3, 8], [(0.5, 0.5), (9, 9), (16.5, 3)], 100 + np.arange(9.0).reshape(3, 3), 0.6)
     cloud = union_of_points([first, second])
-    # 5 is masked in the second placed, 9 in its only one; 8 lies outside.
+    # 5 is masked in the second view, 9 in its only one; 8 lies outside.
     np.testing.assert_array_equal(cloud.xyz, [[103, 104, 105], [6, 7, 8], [0, 1, 2]])
     np.testing.assert_allclose(cloud.colour, [[0.6, 0.2, 0.8], [0.2, 0.2, 0.8], [0.2, 0.2, 0.8]])
 

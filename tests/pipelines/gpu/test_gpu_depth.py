@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from fields.map.keyframes import KeyframeStore
-from pipelines.densify.depth import EpipolarDepth
+from pipelines.densify.depth.epipolar import EpipolarDepth
 from pipelines.settings import EpipolarSettings
 from tests.pipelines.wall import frame
 

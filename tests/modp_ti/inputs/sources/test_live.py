@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 
-from fields.runtime import disk_room
+from fields.runtime import process
 from modp_ti.config.settings import IntrinsicsSettings, SourceSettings
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.klt import open_klt
@@ -292,7 +292,7 @@ def test_room_for_the_map_is_kept_on_the_disk(camera, opened, monkeypatch):
     source = opened()
     arriving = source.arriving(0, None, 1)
     taken = [next(arriving), next(arriving)]
-    monkeypatch.setattr(disk_room, "KEPT_FREE", 1 << 60)
+    monkeypatch.setattr(process, "KEPT_FREE", 1 << 60)
     assert list(arriving) == [] and list(source.names) == taken
     said = f"{source._store.folder.parent}: less than 1 GiB is free for the frames of the live source; "
     assert source.notes[-1].startswith(f"the recording ended: {said}")

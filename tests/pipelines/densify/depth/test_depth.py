@@ -10,14 +10,17 @@ from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from fields.map.keyframe import Keyframe
 from fields.map.keyframes import KeyframeStore
-from pipelines.densify.depth import DepthEstimate, FusedDepth, GaussianProcessDepth, ImageGuidedDepth, MapDepth
+from pipelines.densify.depth.estimate import DepthEstimate, FusedDepth
 from pipelines.densify.depth.gaussian_process import (
+    GaussianProcessDepth,
+    ImageGuidedDepth,
     conditioning_points,
     matern32,
     nonstationary_matern32,
     nonstationary_variance,
     regress_log_depth,
 )
+from pipelines.densify.depth.map_depth import MapDepth
 from pipelines.render.renderer import Renderer
 from pipelines.settings import DepthSettings
 from tests.pipelines.wall import frame, on_the_plane, pose

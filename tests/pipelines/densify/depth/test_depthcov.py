@@ -15,8 +15,7 @@ from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from fields.map.keyframe import Keyframe
 from fields.map.keyframes import KeyframeStore
-from pipelines.densify.depth import DepthCov, load_depthcov
-from pipelines.densify.depth.depthcov import DepthCovWeights, pixel_covariances
+from pipelines.densify.depth.depthcov import DepthCov, DepthCovWeights, load_depthcov, pixel_covariances
 from pipelines.settings import DepthSettings
 from pipelines.torch_checkpoint import read_checkpoint, require_entries
 

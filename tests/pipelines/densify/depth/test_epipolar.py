@@ -8,9 +8,7 @@ import pytest
 from fields.geometry.se3 import inverse_se3
 from fields.map.keyframe import Keyframe
 from fields.map.keyframes import KeyframeStore
-from pipelines.densify.depth import EpipolarDepth
-from pipelines.densify.depth.epipolar import OUTSIDE, RADIUS
-from pipelines.densify.depth.plane_sweep import plane_warp
+from pipelines.densify.depth.epipolar import OUTSIDE, RADIUS, EpipolarDepth, plane_warp
 from pipelines.settings import EpipolarSettings
 from tests.pipelines.wall import CAMERA, frame, on_the_plane, pose
 

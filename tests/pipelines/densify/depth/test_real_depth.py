@@ -14,8 +14,9 @@ from fields.map.keyframes import KeyframeStore
 from modp_ti.config.settings import SceneConfig, SourceSettings
 from modp_ti.config.tracker_settings import ColmapSettings
 from modp_ti.inputs.trackers import open_tracker
-from pipelines.densify.depth import DepthEstimator, EpipolarDepth, FusedDepth, GaussianProcessDepth, ImageGuidedDepth
-from pipelines.densify.depth.estimate import point_depths
+from pipelines.densify.depth.epipolar import EpipolarDepth
+from pipelines.densify.depth.estimate import DepthEstimator, FusedDepth, point_depths
+from pipelines.densify.depth.gaussian_process import GaussianProcessDepth, ImageGuidedDepth
 from pipelines.settings import DepthSettings, EpipolarSettings
 
 DATA = Path(__file__).resolve().parents[5] / "shared" / "data" / "redkitchen"
