@@ -1,4 +1,5 @@
 """Maps within a budget of memory, and large ones."""
+# pyright: reportArgumentType=false, reportOperatorIssue=false, reportOptionalMemberAccess=false
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
 """A map of two walls at places apart, where Gaussians of the first place show in the views of the second."""
+# pyright: reportArgumentType=false
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
 """What a tracker delivers: frames, their pyramids, and corrections."""
+# pyright: reportArgumentType=false
 
 from __future__ import annotations
 

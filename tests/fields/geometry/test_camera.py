@@ -1,4 +1,5 @@
 """The camera model, the metric of its pixels, and vectors in kernels."""
+# pyright: reportArgumentType=false, reportInvalidTypeForm=false
 
 import cv2
 import numpy as np

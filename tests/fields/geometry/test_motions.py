@@ -1,4 +1,5 @@
 """Rigid motions and similarities: laws of the group, against SciPy and PyTorch."""
+# pyright: reportArgumentType=false
 
 from __future__ import annotations
 

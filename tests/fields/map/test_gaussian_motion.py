@@ -1,4 +1,5 @@
 """The move of Gaussians against NumPy and SciPy."""
+# pyright: reportOptionalMemberAccess=false
 
 from __future__ import annotations
 

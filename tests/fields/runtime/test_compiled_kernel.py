@@ -1,3 +1,5 @@
+# pyright: reportArgumentType=false, reportInvalidTypeForm=false, reportOptionalMemberAccess=false
+
 import numpy as np
 import pytest
 import torch

@@ -1,4 +1,5 @@
 """Occupancy voxels, and laws that hold for any points."""
+# pyright: reportArgumentType=false
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
 """A file of blocks that is damaged while a map is made."""
+# pyright: reportArgumentType=false
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
 """Gaussians that hardly show are removed while the map grows."""
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
 """A map with room for a part of the long wall, whose other parts lie on disk."""
+# pyright: reportOptionalMemberAccess=false
 
 from __future__ import annotations
 

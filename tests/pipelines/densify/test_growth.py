@@ -1,4 +1,5 @@
 """Seeds of new Gaussians, how they grow, what a wrong depth costs, and the first points of the offline baseline."""
+# pyright: reportAssignmentType=false
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
 """The surface of a finished map: agreement, matching and planes, against plain projections."""
+# pyright: reportIndexIssue=false
 
 from __future__ import annotations
 

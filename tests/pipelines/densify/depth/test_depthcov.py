@@ -1,4 +1,5 @@
 """DepthCov: its depth, its network and its checkpoint."""
+# pyright: reportArgumentType=false, reportAssignmentType=false, reportReturnType=false
 
 from __future__ import annotations
 
