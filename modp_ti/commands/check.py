@@ -6,7 +6,7 @@ from contextlib import ExitStack
 from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from modp_ti.config.settings import SceneConfig
-    from modp_ti.inputs.inspection.report import Report
     from modp_ti.inputs.trackers import Tracker
 
 __all__ = ["EXAMPLES", "check", "inspect_scene"]
@@ -42,8 +41,8 @@ def check(
         from modp_ti.files.run_folder import require_usable
         from modp_ti.files.terminal import CleanConsole
         from modp_ti.inputs.bare_recording import base_of, named_scene
-        from modp_ti.inputs.inspection import report as reports
-        from modp_ti.inputs.inspection.findings import Finding, Severity, verdict
+        from modp_ti.inputs.inspection.findings import unusable
+        from modp_ti.inputs.inspection.report import judged, print_report
         from modp_ti.inputs.scene_paths import refuse_output_in_input
         from modp_ti.outputs.progress import ProgressLine
 
@@ -52,20 +51,23 @@ def check(
             config = named_scene(scene, set_ or [], say=ProgressLine(console).note)
             refuse_output_in_input(config, base_of(scene))
             require_usable(config.output)
-            report = inspect_scene(config, console)
+            data = inspect_scene(config, console)
         except InputError as error:
-            report = reports.Report(findings=[Finding(Severity.UNUSABLE, "input", one_line(error))])
-        result.code = verdict(report.findings)[1]
-        result.data = reports.as_json(report)
+            data = judged([unusable("input", one_line(error))])
+        result.code, result.data = data["exit_code"], data
         if not as_json:
-            reports.print_report(report, CleanConsole())
+            print_report(data, CleanConsole())
 
 
-def inspect_scene(config: SceneConfig, console: Console) -> Report:
-    """Iterate over a scene's tracker once and judge its frames. Raises InputError if the input cannot be read."""
+def inspect_scene(config: SceneConfig, console: Console) -> dict[str, Any]:
+    """Iterate over a scene's tracker once and judge its frames. Raises InputError if the input cannot be read.
+
+    Returns:
+        Verdict, findings and measurements as plain data for JSON.
+    """
     from modp_ti.inputs.inspection.findings import judge_scale, judge_sequence, measure_scale
     from modp_ti.inputs.inspection.geometry import judge_geometry, measure_geometry
-    from modp_ti.inputs.inspection.report import Report
+    from modp_ti.inputs.inspection.report import judged, measured
     from modp_ti.inputs.inspection.survey import survey
     from modp_ti.inputs.trackers import open_tracker
     from modp_ti.outputs.progress import ProgressLine
@@ -94,7 +96,7 @@ def inspect_scene(config: SceneConfig, console: Console) -> Report:
             *judge_sequence(seen.frames),
             *judge_scale(seen.frames, scale, config.mapping.keyframes.min_points),
         ]
-        return Report(seen.frames, geometry, scale, _lens(tracker), list(tracker.notes), findings)
+        return judged(findings, tracker.notes) | measured(seen.frames, geometry, scale, _lens(tracker))
 
 
 def _lens(tracker: Tracker) -> str:

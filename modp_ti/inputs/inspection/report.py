@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -12,98 +11,78 @@ from rich.console import Console
 from rich.table import Table
 
 from modp_ti.inputs.inspection.conventions import CONVENTIONS
-from modp_ti.inputs.inspection.findings import Finding, Scale, Severity, blurred, duplicates, time_gaps, verdict
+from modp_ti.inputs.inspection.findings import Finding, Scale, blurred, duplicates, time_gaps, verdict
 from modp_ti.inputs.inspection.geometry import Geometry
 from modp_ti.inputs.inspection.survey import FrameRecord
 
-__all__ = ["Report", "as_json", "print_report"]
+__all__ = ["judged", "measured", "print_report"]
 
-SIGNS = {Severity.NOTE: "note", Severity.WARNING: "[yellow]warning[/]", Severity.UNUSABLE: "[red]unusable[/]"}
+SIGNS = {"note": "note", "warning": "[yellow]warning[/]", "unusable": "[red]unusable[/]"}
 
 
-@dataclass
-class Report:
-    """Results of an inspection. If the input cannot be read, only `findings` is set.
+def judged(findings: Sequence[Finding], notes: Sequence[str] = ()) -> dict[str, Any]:
+    """Return findings and notes of the tracker with the verdict, as plain data for JSON."""
+    word, code = verdict(findings)
+    told = [{"severity": f.severity.value, "code": f.code, "text": f.text, "mend": f.mend} for f in findings]
+    return {"verdict": word, "exit_code": code, "findings": told, "notes": list(notes)}
 
-    Attributes:
+
+def measured(frames: Sequence[FrameRecord], geometry: Geometry, scale: Scale, lens: str) -> dict[str, Any]:
+    """Return the measurements as plain data for JSON. Numbers that are not finite become None.
+
+    Args:
         frames: Measurements of each frame.
         geometry: Agreement of poses and intrinsics with the images.
         scale: Depth of the scene and motion of the camera.
         lens: The lens distortion in words.
-        notes: Notes of the tracker.
-        findings: The findings.
     """
-
-    frames: Sequence[FrameRecord] = ()
-    geometry: Geometry | None = None
-    scale: Scale | None = None
-    lens: str = ""
-    notes: list[str] = field(default_factory=list)
-    findings: list[Finding] = field(default_factory=list)
-
-
-def as_json(report: Report) -> dict[str, Any]:
-    """Convert a report to plain data for JSON. Numbers that are not finite become None."""
-    word, code = verdict(report.findings)
-    data: dict[str, Any] = {
-        "verdict": word,
-        "exit_code": code,
-        "findings": [
-            {"severity": f.severity.value, "code": f.code, "text": f.text, "mend": f.mend} for f in report.findings
-        ],
-        "notes": report.notes,
-    }
-    if report.geometry is None or report.scale is None:
-        return data
-    frames = report.frames
     camera = frames[0].camera
     points = np.array([frame.points for frame in frames])
     steps = np.diff([frame.timestamp for frame in frames])
-    return data | {
+    return {
         "frames": len(frames),
         "held_out": sum(frame.held_out for frame in frames),
         "size": [camera.width, camera.height],
         "intrinsics": {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy},
         "cameras": len({frame.camera for frame in frames}),
-        "lens": report.lens,
+        "lens": lens,
         "masked": _number(np.mean([frame.masked for frame in frames])),
         "seconds": _number(frames[-1].timestamp - frames[0].timestamp),
         "seconds_between_frames": _number(np.median(steps)) if len(steps) else None,
         **{check.__name__: [frames[i].name for i in check(frames)] for check in (time_gaps, blurred, duplicates)},
         "points": {"median": int(np.median(points)), "least": int(points.min()), "most": int(points.max())},
         "scale": {
-            "depth": _number(report.scale.depth),
-            "step": _number(report.scale.step),
-            "longest_step": _number(report.scale.longest),
-            "extent": _number(report.scale.extent),
+            "depth": _number(scale.depth),
+            "step": _number(scale.step),
+            "longest_step": _number(scale.longest),
+            "extent": _number(scale.extent),
         },
         "conventions": [
             {
                 "name": c.name,
-                "features_fit": _number(report.geometry.epipolar[c].share),
-                "epipolar_error": _number(report.geometry.epipolar[c].error),
-                "reprojection_error": _number(report.geometry.reprojection[c]) if report.geometry.points else None,
+                "features_fit": _number(geometry.epipolar[c].share),
+                "epipolar_error": _number(geometry.epipolar[c].error),
+                "reprojection_error": _number(geometry.reprojection[c]) if geometry.points else None,
             }
             for c in CONVENTIONS
         ],
-        "matched_features": report.geometry.epipolar[CONVENTIONS[0]].matches,
-        "observations": report.geometry.points,
+        "matched_features": geometry.epipolar[CONVENTIONS[0]].matches,
+        "observations": geometry.points,
     }
 
 
-def print_report(report: Report, console: Console) -> None:
-    """Print notes, tables, findings with corrections, and the verdict in the last line."""
-    data = as_json(report)
-    for note in report.notes:
+def print_report(data: dict[str, Any], console: Console) -> None:
+    """Print the notes, tables, findings with corrections, and verdict of `judged` and `measured`."""
+    for note in data["notes"]:
         console.print(f"note: {note}", highlight=False, soft_wrap=True, markup=False)
     if "frames" in data:
         console.print(_overview(data))
         console.print(_conventions(data))
-    for finding in report.findings:
-        console.print(f"{SIGNS[finding.severity]}: ", end="", highlight=False, markup=True)
-        console.print(finding.text, highlight=False, soft_wrap=True, markup=False)
-        if finding.mend:
-            console.print(f"    -> {finding.mend}", highlight=False, soft_wrap=True, markup=False)
+    for finding in data["findings"]:
+        console.print(f"{SIGNS[finding['severity']]}: ", end="", highlight=False, markup=True)
+        console.print(finding["text"], highlight=False, soft_wrap=True, markup=False)
+        if finding["mend"]:
+            console.print(f"    -> {finding['mend']}", highlight=False, soft_wrap=True, markup=False)
     console.print(f"verdict: {data['verdict']}", highlight=False)
 
 
