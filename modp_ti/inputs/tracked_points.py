@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from fields.frames.camera_revision import CameraRevision
 from fields.frames.tracked_frame import TrackedFrame
-from modp_ti.inputs.multiview.point_solving import placed_anew
+from modp_ti.inputs.multiview.points_and_poses import placed_anew
 from modp_ti.inputs.multiview.reprojection import Observations
 from modp_ti.inputs.rows_of_ids import RowsOfIds
 from pipelines.memory_budget import OBSERVATION

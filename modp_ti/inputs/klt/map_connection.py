@@ -22,7 +22,7 @@ from modp_ti.inputs.klt.recognition import (
 from modp_ti.inputs.klt.tracking import Tracking
 from modp_ti.inputs.multiview.reprojection import estimated, ray_errors
 
-__all__ = ["MapJoining", "connected", "inverse_similarity", "joint_similarity"]
+__all__ = ["MapJoining", "connected", "joint_similarity"]
 
 ROUNDS = 2  # bundle adjustments, each without the outliers of the one before
 # The map contradicts a connection if the residuals of more of the connecting observations, or of the others, are those
@@ -179,8 +179,3 @@ def joint_similarity(
         return count
 
     return max(candidates, key=fitting)
-
-
-def inverse_similarity(S: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The inverse (4, 4) of a similarity (4, 4)."""
-    return np.asarray(np.linalg.inv(S), dtype=np.float64)

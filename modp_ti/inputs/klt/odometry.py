@@ -14,7 +14,7 @@ from modp_ti.inputs.klt.frame import Frame
 from modp_ti.inputs.klt.initialisation import Initialisation
 from modp_ti.inputs.klt.landmark_map import LandmarkMap
 from modp_ti.inputs.klt.loop_closing import LoopClosing
-from modp_ti.inputs.klt.map_connection import MapJoining, connected, inverse_similarity, joint_similarity
+from modp_ti.inputs.klt.map_connection import MapJoining, connected, joint_similarity
 from modp_ti.inputs.klt.tracking import Tracking, View
 
 __all__ = ["Odometry"]
@@ -225,7 +225,7 @@ class Odometry:
         # The run's map, or the older one, keeps its world and its ids.
         stays, goes = other, active
         if active is self._run or (other is not self._run and self._maps.index(active) < self._maps.index(other)):
-            stays, goes, S = active, other, inverse_similarity(S)
+            stays, goes, S = active, other, np.linalg.inv(S)
         joint = stays.tracking.map.copy()
         joint.absorb(goes.tracking.map.copy(), S)
         if not connected(joint, recognitions):

@@ -210,32 +210,14 @@ def refine_points(poses: NDArray[np.float64], seen: Observations, xyz: NDArray[n
         p = np.einsum("mij,mj->mi", rotation, xyz[seen.point]) + translation
         z = np.where(np.abs(p[:, 2]) < 1e-9, 1e-9, p[:, 2])
         uv = p[:, :2] / z[:, None]
-        residual, weight = _cauchy(uv, seen.rays, sigma)
+        residual = (uv - seen.rays) / sigma
+        weight = 1.0 / (1.0 + (residual**2).sum(axis=1))  # under the loss
         jacobian = (rotation[:, :2] - uv[:, :, None] * rotation[:, 2:]) / (z * seen.sigma)[:, None, None]
-        left, right = _normal_equations(jacobian, residual, weight, seen.point, len(xyz))
+        weighted = weight[:, None, None] * jacobian
+        left = sum_by_point(seen.point, np.einsum("mki,mkj->mij", weighted, jacobian), len(xyz))
+        right = sum_by_point(seen.point, np.einsum("mki,mk->mi", weighted, residual), len(xyz))
         xyz = xyz - solve_damped(left, right, 1e-6)
     return xyz
-
-
-def _cauchy(
-    uv: NDArray[np.float64], rays: NDArray[np.float64], sigma: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Residuals (M, 2) in units of `sigma`, and their weights (M,) under a Cauchy loss."""
-    residual = (uv - rays) / sigma
-    return residual, 1.0 / (1.0 + (residual**2).sum(axis=1))
-
-
-def _normal_equations(
-    jacobian: NDArray[np.float64],
-    residual: NDArray[np.float64],
-    weight: NDArray[np.float64],
-    point: NDArray[np.int64],
-    count: int,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """J^T W J (count, K, K) and J^T W r (count, K) of each point, from Jacobians (M, 2, K)."""
-    weighted = weight[:, None, None] * jacobian
-    left = sum_by_point(point, np.einsum("mki,mkj->mij", weighted, jacobian), count)
-    return left, sum_by_point(point, np.einsum("mki,mk->mi", weighted, residual), count)
 
 
 def sum_by_point(point: NDArray[np.int64], values: NDArray[np.float64], count: int) -> NDArray[np.float64]:

@@ -9,10 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.frames.origin import far_centre, shifted_poses
-from modp_ti.inputs.multiview.feature_tracks import feature_tracks
-from modp_ti.inputs.multiview.features import MAX_FEATURES, Features, detect_features, essential_matrix, match_features
+from modp_ti.inputs.multiview.features import (
+    MAX_FEATURES,
+    Features,
+    detect_features,
+    essential_matrix,
+    feature_tracks,
+    match_features,
+)
 from modp_ti.inputs.multiview.followed_features import EPIPOLAR_BAND, follow_features, looks_like_video
-from modp_ti.inputs.multiview.point_solving import solve_points, surest_points
+from modp_ti.inputs.multiview.points_and_poses import adjusted_poses, solve_points, surest_points
 from modp_ti.inputs.multiview.reprojection import Observations, point_errors
 from modp_ti.inputs.protocol import Progress
 from modp_ti.inputs.replay import PosedImage, points_inside
@@ -85,9 +91,6 @@ def adjusted_frames(
     Returns:
         The frames with adjusted poses and points, and a note on the change of the reprojection error.
     """
-    # Imported here, because readers must not load Taichi.
-    from modp_ti.inputs.multiview.pose_adjustment import adjusted_poses
-
     sequence = _Sequence(images, frames, solves, progress)
     seen = sequence.seen(WIDE_BAND)
     given = poses = sequence.poses

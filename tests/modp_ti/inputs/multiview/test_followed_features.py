@@ -18,6 +18,7 @@ from modp_ti.inputs.replay import PosedImage
 from modp_ti.inputs.sources import Distortion, ImageFolder, Undistorter
 
 FRAMES = 16
+HELD_OUT = np.arange(FRAMES) % 4 == 0
 SIZE = (240, 180)
 CAMERA = PinholeCamera(220.0, 220.0, 120.5, 89.0, *SIZE)
 METRES = 0.01  # of a texel of the plane z = 0
@@ -108,26 +109,6 @@ def test_a_lens_is_followed_through_too(video, tmp_path, monkeypatch):
     assert len(z) > 1500 and np.median(np.abs(z)) < 0.03
 
 
-def test_held_out_frames_change_nothing_but_what_they_are_told(video, tmp_path, monkeypatch):
-    monkeypatch.setattr(triangulation, "FEW_FRAMES", 5)
-    held_out = np.arange(FRAMES) % 4 == 0
-    images, frames = posed(video)
-    before = triangulation.triangulated_frames(images, frames, ~held_out)
-    for i, file in enumerate(sorted(video[0].iterdir())):
-        image = np.array(Image.open(file))
-        cv2.imwrite(str(tmp_path / file.name), 255 - image if held_out[i] else image)
-    other, _ = posed((tmp_path, video[1]))
-    after = triangulation.triangulated_frames(other, frames, ~held_out)
-    places = [{tuple(xyz) for frame in frames for xyz in frame.points.xyz} for frames in (before, after)]
-    assert len(places[0]) > 150
-    assert places[0] == places[1], "bit for bit"
-    for i in np.flatnonzero(~held_out):
-        assert np.array_equal(before[i].points.pixels, after[i].points.pixels)
-        assert np.array_equal(before[i].points.ids, after[i].points.ids)
-    assert all(len(before[i].points) >= 80 for i in np.flatnonzero(held_out)), "the first frame too"
-    assert all(len(after[i].points) < 20 for i in np.flatnonzero(held_out)), "a negative shows none of the corners"
-
-
 def off(video) -> np.ndarray:
     """The poses, each turned by half a degree and shifted by two pixels or so."""
     rng = np.random.default_rng(2)
@@ -144,12 +125,11 @@ def next_turns(poses: np.ndarray) -> Rotation:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("few", [5, 60], ids=["followed", "matched"])
-def test_adjusted_poses_are_those_of_the_images_and_none_hangs_on_held_out_ones(video, tmp_path, monkeypatch, few):
+def test_adjusted_poses_are_those_of_the_images(video, monkeypatch, few):
     monkeypatch.setattr(triangulation, "FEW_FRAMES", few)
-    held_out = np.arange(FRAMES) % 4 == 0
     wrong = off(video)
     images, frames = posed((video[0], wrong))
-    result, note = triangulation.adjusted_frames(images, frames, ~held_out)
+    result, note = triangulation.adjusted_frames(images, frames, ~HELD_OUT)
     before, after = (float(word) for word in re.findall(r"([\d.]+) px", note))
     assert after < 0.5 < before
     found = np.stack([frame.T_camera_world for frame in result])
@@ -158,18 +138,33 @@ def test_adjusted_poses_are_those_of_the_images_and_none_hangs_on_held_out_ones(
     assert np.median(before) > 0.4
     assert np.median(after) < 0.08 and after.max() < 0.25, "held-out frames too"
     for i, frame in enumerate(result):
-        assert len(frame.points) >= (80 if held_out[i] else 100)
+        assert len(frame.points) >= (80 if HELD_OUT[i] else 100)
         p = frame.points.xyz @ frame.T_camera_world[:3, :3].T + frame.T_camera_world[:3, 3]
         assert np.median(np.linalg.norm(CAMERA.project(p) - frame.points.pixels, axis=1)) < 0.5
 
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("few", "adjusts"), [(5, False), (5, True), (60, True)])
+def test_held_out_frames_change_nothing_but_their_own(video, tmp_path, monkeypatch, few, adjusts):
+    """Whatever they show, the points and the poses of the others are the same bit for bit."""
+    monkeypatch.setattr(triangulation, "FEW_FRAMES", few)
     for i, file in enumerate(sorted(video[0].iterdir())):
         image = np.array(Image.open(file))
-        cv2.imwrite(str(tmp_path / file.name), 255 - image[::-1] if held_out[i] else image)
-    other, _ = posed((tmp_path, wrong))
-    again, _ = triangulation.adjusted_frames(other, frames, ~held_out)
-    for i in np.flatnonzero(~held_out):
-        assert np.array_equal(result[i].T_camera_world, again[i].T_camera_world), "bit for bit"
-        assert np.array_equal(result[i].points.xyz, again[i].points.xyz)
+        cv2.imwrite(str(tmp_path / file.name), 255 - image[::-1] if HELD_OUT[i] else image)
+    poses, results = off(video) if adjusts else video[1], []
+    for folder in (video[0], tmp_path):
+        images, frames = posed((folder, poses))
+        if adjusts:
+            results.append(triangulation.adjusted_frames(images, frames, ~HELD_OUT)[0])
+        else:
+            results.append(triangulation.triangulated_frames(images, frames, ~HELD_OUT))
+    for held_out, before, after in zip(HELD_OUT, *results, strict=True):
+        if held_out:
+            assert len(before.points) >= 80 and len(after.points) < 20, "a negative shows none of the corners"
+            continue
+        assert np.array_equal(before.T_camera_world, after.T_camera_world)
+        for each in ("xyz", "pixels", "ids"):
+            assert np.array_equal(getattr(before.points, each), getattr(after.points, each))
 
 
 def test_frames_without_overlap_are_no_video(video, tmp_path):
