@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -11,6 +13,11 @@ import pytest
 from numpy.typing import NDArray
 
 from fields.geometry.camera import PinholeCamera
+from fields.geometry.se3 import camera_centres
+from modp_ti.inputs.klt.camera import Lens
+from modp_ti.inputs.klt.odometry import Odometry
+from modp_ti.inputs.klt.tracking import View
+from modp_ti.outputs.evaluation import umeyama
 from tests.room import look_at
 
 # Corners of the room [m], texels per metre.
@@ -114,3 +121,38 @@ class Walk:
 def box_walk(box_room: BoxRoom) -> Walk:
     poses = walk(60)
     return Walk(poses, [box_room.image(T) for T in poses])
+
+
+BLACK = np.zeros((240, 320), np.uint8)
+
+
+def followed(box_room: BoxRoom, greys: Sequence[NDArray[np.uint8]], **settings: Any) -> Followed:
+    """Follow grey images with the known camera. No frame may come twice."""
+    odometry, views, brought = Odometry([Lens.pinhole(box_room.camera)], **settings), {}, []
+    for number in range(len(greys) + 1):
+        found = odometry.process(number, greys[number]) if number < len(greys) else odometry.finish()
+        brought.append([view.number for view in found])
+        assert not set(brought[-1]) & set(views)
+        views |= {view.number: view for view in found}
+    return Followed(odometry, views, brought)
+
+
+@dataclass(frozen=True)
+class Followed:
+    """The odometry, all views, and the numbers of the views that each frame and the end brought."""
+
+    odometry: Odometry
+    views: dict[int, View]
+    brought: list[list[int]]
+
+    def errors(self, truth: Mapping[int, NDArray[np.float64]]) -> NDArray[np.float64]:
+        """Distances [m] of camera centres from the true ones after the best similarity."""
+        estimate = camera_centres([self.views[i].T_camera_world for i in truth])
+        target = camera_centres(list(truth.values()))
+        s, R, t = umeyama(estimate, target)
+        return np.linalg.norm(s * estimate @ R.T + t - target, axis=1)
+
+    @property
+    def poses(self) -> list[bytes]:
+        """All poses, bit for bit."""
+        return [self.views[i].T_camera_world.tobytes() for i in sorted(self.views)]

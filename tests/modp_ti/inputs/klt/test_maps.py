@@ -6,42 +6,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-from fields.geometry.se3 import exp_se3, inverse_se3
+from fields.geometry.se3 import exp_se3
 from fields.geometry.similarity import moved_points, moved_pose
 from modp_ti.inputs.klt.camera import Lens
 from modp_ti.inputs.klt.landmark_map import Keyframe, LandmarkMap
 from modp_ti.inputs.klt.map_connection import MapJoining
-from modp_ti.inputs.klt.odometry import Odometry
 from modp_ti.inputs.klt.recognition import Recognition
-from modp_ti.inputs.klt.tracking import View
 from modp_ti.inputs.multiview.reprojection import ray_errors
-from modp_ti.outputs.evaluation import umeyama
-from tests.modp_ti.inputs.klt.conftest import turning_walk
-
-BLACK = np.zeros((240, 320), np.uint8)
+from tests.modp_ti.inputs.klt.conftest import BLACK, BoxRoom, followed, turning_walk
 
 
-def processed(box_room, greys: list[NDArray[np.uint8]]) -> tuple[Odometry, dict[int, View], list[list[int]]]:
-    """The odometry, all views, and the numbers of the views that each frame brought."""
-    odometry, views, brought = Odometry([Lens.pinhole(box_room.camera)], begins_anew_after=5), {}, []
-    for number, grey in enumerate(greys):
-        found = odometry.process(number, grey)
-        brought.append([view.number for view in found])
-        assert not set(brought[-1]) & set(views)
-        views |= {view.number: view for view in found}
-    brought.append([view.number for view in odometry.finish()])
-    return odometry, views, brought
-
-
-def errors(odometry: Odometry, views: dict[int, View], truth: dict[int, NDArray[np.float64]]) -> NDArray[np.float64]:
-    """Distances [m] of camera centres from the true ones after the best similarity."""
-    assert odometry.tracking is not None
-    estimate = np.array([inverse_se3(odometry.tracking.pose(views[i]))[:3, 3] for i in truth])
-    target = np.array([inverse_se3(T)[:3, 3] for T in truth.values()])
-    s, R, t = umeyama(estimate, target)
-    return np.linalg.norm(s * estimate @ R.T + t - target, axis=1)
+def mirrored(room: BoxRoom) -> BoxRoom:
+    """Another place."""
+    return replace(room, textures={wall: sheet[::-1].copy() for wall, sheet in room.textures.items()})
 
 
 @pytest.mark.slow
@@ -55,16 +33,16 @@ def test_a_map_begun_after_a_cut_is_joined_when_it_shows_the_first_ones_place(bo
         greys = [*there_greys, *[BLACK] * 8, *wall_greys, *[box_room.grey(T) for T in turning_walk(60)[:29:-1]]]
     else:
         poses, greys = [*walls, *[None] * 8, *there], [*wall_greys, *[BLACK] * 8, *there_greys]
-    odometry, views, brought = processed(box_room, greys)
+    found = followed(box_room, greys, begins_anew_after=5)
+    odometry, views = found.odometry, found.views
     truth = {i: T for i, T in enumerate(poses) if T is not None}
     assert odometry.joined == 1 and not odometry.waiting
     assert sorted(views) == sorted(truth)
-    assert errors(odometry, views, truth).max() < 0.03
-    late = max(len(each) for each in brought[10:])
+    assert found.errors(truth).max() < 0.03
+    late = max(len(each) for each in found.brought[10:])
     assert late >= 10, "the frames of the second map come when it is joined"
     if not turned_first:
-        _, again, _ = processed(box_room, greys)
-        assert all(views[i].T_camera_world.tobytes() == again[i].T_camera_world.tobytes() for i in truth)
+        assert followed(box_room, greys, begins_anew_after=5).poses == found.poses
 
 
 @pytest.mark.slow
@@ -78,38 +56,35 @@ def test_a_join_that_the_map_contradicts_leaves_both_maps_as_they_are(box_room, 
         tried[:] = [Recognition(of, by, pairs, np.eye(4), of.T_camera_world, 1.0) for by in active.map.keyframes[-3:]]
         return others[0], list(tried)
 
-    other = replace(box_room, textures={wall: sheet[::-1].copy() for wall, sheet in box_room.textures.items()})
+    other = mirrored(box_room)
     greys = [*box_walk.grey[:30], *[BLACK] * 8, *(other.grey(T) for T in box_walk.poses[:30])]
     results = []
     for found in (lambda *_: None, wrong):
         monkeypatch.setattr(MapJoining, "found", found)
-        odometry, views, _ = processed(box_room, greys)
-        apart = [view.T_camera_world for submap in odometry._maps for view in submap.waiting]
-        results.append([*(views[i].T_camera_world for i in sorted(views)), *apart])
-        assert odometry.joined == 0 and odometry.undone == (1 if tried else 0)
+        each = followed(box_room, greys, begins_anew_after=5)
+        results.append((each.poses, each.odometry.waiting))
+        assert each.odometry.joined == 0 and each.odometry.undone == (1 if tried else 0)
     assert tried
-    assert [T.tobytes() for T in results[0]] == [T.tobytes() for T in results[1]]
+    assert results[0] == results[1]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("between", [0, 8])
 def test_frames_of_another_place_stay_out_of_the_map(box_room, box_walk, between):
-    other = replace(
-        box_room, textures={wall: sheet[::-1].copy() for wall, sheet in box_room.textures.items()}
-    )  # mirrored
+    other = mirrored(box_room)
     greys = [*box_walk.grey[:30], *[BLACK] * between, *(other.grey(T) for T in box_walk.poses[:25])]
-    odometry, views, _ = processed(box_room, greys)
-    assert sorted(views) == list(range(30))
-    assert odometry.joined == 0
-    assert odometry.waiting == [list(range(30 + between, len(greys)))]
+    found = followed(box_room, greys, begins_anew_after=5)
+    assert sorted(found.views) == list(range(30))
+    assert found.odometry.joined == 0
+    assert found.odometry.waiting == [list(range(30 + between, len(greys)))]
 
 
 @pytest.mark.slow
 def test_the_largest_map_is_the_runs_if_the_first_is_lost_at_its_start(box_room, box_walk):
     other = [np.ascontiguousarray(grey[::-1]) for grey in box_walk.grey[:9]]
-    odometry, views, _ = processed(box_room, [*other, *[BLACK] * 8, *box_walk.grey[:40]])
-    assert sorted(views) == list(range(17, 57))
-    assert odometry.waiting == [list(range(9))]
+    found = followed(box_room, [*other, *[BLACK] * 8, *box_walk.grey[:40]], begins_anew_after=5)
+    assert sorted(found.views) == list(range(17, 57))
+    assert found.odometry.waiting == [list(range(9))]
 
 
 def test_a_map_keeps_its_observations_when_another_absorbs_it():
@@ -149,33 +124,22 @@ def test_only_the_first_frames_of_a_recording_wait_and_not_those_of_a_camera(box
     """Both know their first map at the same frame. A recording has yet to see that it is no bad start."""
     first = {}
     for waits in (False, True):
-        odometry = Odometry([Lens.pinhole(box_room.camera)], begins_anew_after=5, waits=waits)
-        brought = [[view.number for view in odometry.process(n, grey)] for n, grey in enumerate(box_walk.grey[:40])]
-        first[waits] = next(n for n, numbers in enumerate(brought) if numbers)
-        assert [number for numbers in brought for number in numbers] == list(range(40))
+        found = followed(box_room, box_walk.grey[:40], begins_anew_after=5, waits=waits)
+        first[waits] = next(n for n, numbers in enumerate(found.brought) if numbers)
+        assert list(found.views) == list(range(40))
     assert first[False] + 5 <= first[True] < 40
-
-
-@pytest.fixture(scope="module")
-def two_places(box_room, box_walk) -> tuple[list[NDArray[np.uint8]], list[int], list[int]]:
-    """Grey images of a place, of nothing, and for longer of another; with the frames of both."""
-    other = replace(box_room, textures={wall: sheet[::-1].copy() for wall, sheet in box_room.textures.items()})
-    greys = [*(other.grey(T) for T in box_walk.poses[:45]), *[BLACK] * 8, *box_walk.grey]
-    return greys, list(range(45)), list(range(53, 113))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("place", [1, 2, 3])
-def test_the_map_of_a_place_by_size_is_chosen_when_all_frames_are_tracked(box_room, box_walk, two_places, place):
-    greys, first, second = two_places
-    odometry = Odometry([Lens.pinhole(box_room.camera)], begins_anew_after=5, place=place)
-    assert [view for number, grey in enumerate(greys) for view in odometry.process(number, grey)] == []
-    views = {view.number: view for view in odometry.finish()}
-    assert odometry.places == 2
+def test_the_map_of_a_place_by_size_is_chosen_when_all_frames_are_tracked(box_room, box_walk, place):
+    """A place, nothing, and for longer another place."""
+    greys = [*(mirrored(box_room).grey(T) for T in box_walk.poses[:45]), *[BLACK] * 8, *box_walk.grey]
+    found = followed(box_room, greys, begins_anew_after=5, place=place)
+    assert found.odometry.places == 2 and list(found.views) == found.brought[-1]
     if place == 3:
-        assert views == {} and odometry.tracking is None
+        assert not found.views and found.odometry.tracking is None
         return
-    expected, others = (second, first) if place == 1 else (first, second)
-    assert list(views) == expected and odometry.waiting == [others]
-    truth = dict(zip(expected, box_walk.poses, strict=False))
-    assert errors(odometry, views, truth).max() < 0.02
+    expected, others = [range(45), range(53, 113)][:: 1 if place == 2 else -1]
+    assert list(found.views) == list(expected) and found.odometry.waiting == [list(others)]
+    assert found.errors(dict(zip(expected, box_walk.poses, strict=False))).max() < 0.02

@@ -2,160 +2,124 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fields.geometry.se3 import inverse_se3
-from modp_ti.inputs.klt.camera import Lens
-from modp_ti.inputs.klt.odometry import Odometry
-from modp_ti.inputs.klt.tracking import Tracking, View
-from modp_ti.outputs.evaluation import umeyama
+from tests.modp_ti.inputs.klt.conftest import BLACK, BoxRoom, Walk, followed
 from tests.room import look_at
 
 pytestmark = pytest.mark.slow
 
-BLACK = np.zeros((240, 320), np.uint8)
+Sequence = tuple[list[NDArray[np.uint8]], list[NDArray[np.float64] | None]]
+SEQUENCES: dict[str, tuple[float, Callable[[BoxRoom, Walk], Sequence]]] = {}
 
 
-def processed(box_room, greys: list[NDArray[np.uint8]]) -> tuple[Odometry, dict[int, View]]:
-    odometry, views = Odometry([Lens.pinhole(box_room.camera)]), {}
-    for number, grey in enumerate(greys):
-        for view in odometry.process(number, grey):
-            assert view.number not in views
-            views[view.number] = view
-    return odometry, views
+def sequence(largest_error: float) -> Callable[[Any], Any]:
+    """A sequence of grey images with their poses, None where there is nothing to be placed by; all others must be."""
+
+    def kept(make: Callable[[BoxRoom, Walk], Sequence]) -> None:
+        SEQUENCES[make.__name__] = largest_error, make
+
+    return kept
 
 
-def tracked(box_room, greys: list[NDArray[np.uint8]]) -> tuple[Tracking, dict[int, View]]:
-    odometry, views = processed(box_room, greys)
-    assert odometry.tracking is not None
-    return odometry.tracking, views
+@sequence(0.015)  # of 1.8 m; 0.007 at most
+def every_frame_of_a_walk(room: BoxRoom, walk: Walk) -> Sequence:
+    return walk.grey, [*walk.poses]
 
 
-def errors(tracking: Tracking, views: dict[int, View], truth: dict[int, NDArray[np.float64]]) -> NDArray[np.float64]:
-    """Distances [m] of camera centres from the true ones after the best similarity."""
-    estimate = np.array([inverse_se3(tracking.pose(views[i]))[:3, 3] for i in truth])
-    target = np.array([inverse_se3(T)[:3, 3] for T in truth.values()])
-    s, R, t = umeyama(estimate, target)
-    return np.linalg.norm(s * estimate @ R.T + t - target, axis=1)
-
-
-def test_every_frame_of_a_walk_gets_its_pose_and_points_their_depth(box_room, box_walk):
-    tracking, views = tracked(box_room, box_walk.grey)
-    assert sorted(views) == list(range(60))  # those from before the map began too
-    assert errors(tracking, views, dict(enumerate(box_walk.poses))).max() < 0.015  # of 1.8 m; 0.007 at most
-
-    view = views[50]
-    known = tracking.map.known[view.ids]
-    assert known.sum() > 150
-    T = tracking.pose(view)
-    z = tracking.map.xyz[view.ids[known]] @ T[2, :3] + T[2, 3]
-    ratio = z / box_room.depth(box_walk.poses[50], view.pixels[known])
-    assert np.median(np.abs(ratio / np.median(ratio) - 1)) < 0.01
-
-
-def test_a_turn_on_the_spot_makes_no_map(box_room):
-    eye = np.array([-1.2, -1.2, 1.3])
-    turns = [look_at(eye, np.array([x, 3.0, 1.0])) for x in np.linspace(-1.5, 0.5, 20)]
-    odometry, views = processed(box_room, [box_room.grey(T) for T in turns])
-    assert odometry.tracking is None and not views
-
-
-def test_frames_that_only_turned_at_the_start_get_poses_once_there_is_a_map(box_room, box_walk):
-    eye, target = inverse_se3(box_walk.poses[0])[:3, 3], np.array([-1.0, 3.0, 1.04])
+@sequence(0.02)
+def a_turn_on_the_spot_before_the_walk(room: BoxRoom, walk: Walk) -> Sequence:
+    eye, target = np.linalg.inv(walk.poses[0])[:3, 3], np.array([-1.0, 3.0, 1.04])
     turns = [look_at(eye, target + np.array([x, 0.0, 0.0])) for x in np.linspace(-1.0, 0.0, 12, endpoint=False)]
-    poses = [*turns, *box_walk.poses[:35]]
-    tracking, views = tracked(box_room, [*(box_room.grey(T) for T in turns), *box_walk.grey[:35]])
-    assert sorted(views) == list(range(47))
-    assert errors(tracking, views, dict(enumerate(poses))).max() < 0.02
+    return [*map(room.grey, turns), *walk.grey[:35]], [*turns, *walk.poses[:35]]
 
 
-def test_repeated_frames_have_one_pose(box_room, box_walk):
-    tracking, views = tracked(box_room, [grey for grey in box_walk.grey[:30] for _ in range(2)])
-    assert len(views) == 60
-    poses = [tracking.pose(views[i]) for i in range(60)]
-    step = np.linalg.norm(inverse_se3(poses[58])[:3, 3] - inverse_se3(poses[56])[:3, 3])
-    for a, b in zip(poses[40::2], poses[41::2], strict=True):
-        assert np.linalg.norm(inverse_se3(a)[:3, 3] - inverse_se3(b)[:3, 3]) < 0.1 * step
+@sequence(0.01)
+def repeated_frames(room: BoxRoom, walk: Walk) -> Sequence:
+    return [g for g in walk.grey[:30] for _ in range(2)], [T for T in walk.poses[:30] for _ in range(2)]
 
 
-def test_black_frames_are_skipped_and_the_camera_is_found_again(box_room, box_walk):
-    greys = [BLACK, BLACK, *box_walk.grey[:30], BLACK, BLACK, BLACK, *box_walk.grey[27:50]]
-    poses = [None, None, *box_walk.poses[:30], None, None, None, *box_walk.poses[27:50]]
-    tracking, views = tracked(box_room, greys)
-    assert sorted(views) == [i for i, T in enumerate(poses) if T is not None]
-    assert tracking.recovered == 1
-    assert errors(tracking, views, {i: T for i, T in enumerate(poses) if T is not None}).max() < 0.02
+@sequence(0.02)
+def black_frames(room: BoxRoom, walk: Walk) -> Sequence:
+    greys = [BLACK, BLACK, *walk.grey[:30], BLACK, BLACK, BLACK, *walk.grey[27:50]]
+    return greys, [None, None, *walk.poses[:30], None, None, None, *walk.poses[27:50]]
 
 
-def test_after_a_cut_nothing_is_placed_until_the_scene_is_back(box_room, box_walk):
+@sequence(0.02)
+def frames_of_another_place(room: BoxRoom, walk: Walk) -> Sequence:
     rng = np.random.default_rng(3)
     elsewhere = [np.kron(rng.integers(0, 255, (30, 40)), np.ones((8, 8))).astype(np.uint8) for _ in range(4)]
-    tracking, views = tracked(box_room, [*box_walk.grey[:30], *elsewhere, *box_walk.grey[20:40]])
-    assert sorted(views) == [*range(30), *range(34, 54)]
-    truth = {**dict(enumerate(box_walk.poses[:30])), **{34 + i: T for i, T in enumerate(box_walk.poses[20:40])}}
-    assert errors(tracking, views, truth).max() < 0.02
+    return [*walk.grey[:30], *elsewhere, *walk.grey[20:40]], [*walk.poses[:30], *[None] * 4, *walk.poses[20:40]]
 
 
-def test_steps_too_wide_for_flow_are_crossed_by_features(box_room, box_walk):
-    """From frame 25 to frame 50 the picture moves by 60 pixels and turns away."""
+@sequence(0.02)
+def a_step_of_60_pixels_that_only_features_cross(room: BoxRoom, walk: Walk) -> Sequence:
     order = [*range(26), *range(50, 60)]
-    tracking, views = tracked(box_room, [box_walk.grey[i] for i in order])
-    assert len(views) == len(order)
-    assert errors(tracking, views, {n: box_walk.poses[i] for n, i in enumerate(order)}).max() < 0.02
+    return [walk.grey[i] for i in order], [walk.poses[i] for i in order]
 
 
-@pytest.mark.parametrize("grey", [BLACK, np.full((240, 320), 90, np.uint8)])
-def test_pictures_of_nothing_make_no_map(box_room, grey):
-    odometry, views = processed(box_room, [grey] * 6)
-    assert odometry.tracking is None and not views
+@sequence(0.02)
+def light_that_changes(room: BoxRoom, walk: Walk) -> Sequence:
+    return [lit(grey, 0.8 + 0.3 * np.sin(i / 4)) for i, grey in enumerate(walk.grey)], [*walk.poses]
 
 
-def test_the_same_images_give_the_same_poses(box_room, box_walk):
-    runs = [tracked(box_room, box_walk.grey[:35]) for _ in range(2)]
-    a, b = ([tracking.pose(view) for view in views.values()] for tracking, views in runs)
-    np.testing.assert_array_equal(a, b)
+@sequence(0.03)
+def bands_of_light_that_wander_over_the_rows(room: BoxRoom, walk: Walk) -> Sequence:
+    rows = np.arange(240)[:, None] / 100.0
+    bands = [0.75 + 0.3 * np.sin(2 * np.pi * (rows + 0.37 * i)) for i in range(60)]
+    return [lit(grey, band) for grey, band in zip(walk.grey, bands, strict=True)], [*walk.poses]
 
 
-def test_light_that_changes_does_not_lose_the_camera(box_room, box_walk):
-    greys = [np.clip(g * (0.8 + 0.3 * np.sin(i / 4)), 0, 255).astype(np.uint8) for i, g in enumerate(box_walk.grey)]
-    tracking, views = tracked(box_room, greys)
-    assert len(views) == 60
-    assert errors(tracking, views, dict(enumerate(box_walk.poses))).max() < 0.02
+@sequence(0.02)
+def frames_of_nothing_but_blur(room: BoxRoom, walk: Walk) -> Sequence:
+    kernel, blurred = np.full((81, 81), 1 / 81**2, np.float32), range(30, 36)
+    greys = [cv2.filter2D(grey, -1, kernel) if i in blurred else grey for i, grey in enumerate(walk.grey)]
+    return greys, [None if i in blurred else T for i, T in enumerate(walk.poses)]
 
 
-def banded(grey: NDArray[np.uint8], phase: float, depth: float = 0.3) -> NDArray[np.uint8]:
-    """The image under a lamp that flickers while the rows are exposed one after the other."""
-    rows = np.arange(len(grey))[:, None]
-    return np.clip(grey * (0.75 + depth * np.sin(2 * np.pi * (rows / 100.0 + phase))), 0, 255).astype(np.uint8)
+@sequence(0.03)
+def something_as_wide_as_a_third_that_walks_through_the_picture(room: BoxRoom, walk: Walk) -> Sequence:
+    walker = walk.grey[0][:, 100:205][:, ::-1]
+    wide = [np.pad(grey, ((0, 0), (150, 250))) for grey in walk.grey]
+    for i, grey in enumerate(wide):
+        grey[:, 8 * i : 8 * i + 105] = walker
+    return [np.ascontiguousarray(grey[:, 150:470]) for grey in wide], [*walk.poses]
 
 
-def test_bands_of_light_that_wander_over_the_rows_do_not_lose_the_camera(box_room, box_walk):
-    tracking, views = tracked(box_room, [banded(grey, 0.37 * i) for i, grey in enumerate(box_walk.grey)])
-    assert len(views) == 60
-    assert errors(tracking, views, dict(enumerate(box_walk.poses))).max() < 0.03
+def lit(grey: NDArray[np.uint8], gain: NDArray[np.float64] | float) -> NDArray[np.uint8]:
+    return np.clip(grey * gain, 0, 255).astype(np.uint8)
 
 
-def test_the_camera_is_found_again_after_frames_of_nothing_but_blur(box_room, box_walk):
-    kernel = np.full((81, 81), 1 / 81**2, np.float32)
-    greys = [cv2.filter2D(grey, -1, kernel) if 30 <= i < 36 else grey for i, grey in enumerate(box_walk.grey)]
-    tracking, views = tracked(box_room, greys)
-    assert sorted(views) == [*range(30), *range(36, 60)]
-    assert errors(tracking, views, {i: T for i, T in enumerate(box_walk.poses) if i in views}).max() < 0.02
+@pytest.mark.parametrize("name", SEQUENCES)
+def test_what_can_be_placed_is_placed_near_the_truth(box_room: BoxRoom, box_walk: Walk, name: str) -> None:
+    largest_error, make = SEQUENCES[name]
+    greys, poses = make(box_room, box_walk)
+    truth = {i: T for i, T in enumerate(poses) if T is not None}
+    found = followed(box_room, greys)
+    assert sorted(found.views) == list(truth)
+    assert found.errors(truth).max() < largest_error
+    if name != "every_frame_of_a_walk":
+        return
+    assert found.odometry.tracking is not None
+    view, landmarks = found.views[50], found.odometry.tracking.map
+    known = landmarks.known[view.ids]
+    assert known.sum() > 150
+    z = landmarks.xyz[view.ids[known]] @ view.T_camera_world[2, :3] + view.T_camera_world[2, 3]
+    ratio = z / box_room.depth(poses[50], view.pixels[known])
+    assert np.median(np.abs(ratio / np.median(ratio) - 1)) < 0.01
+    assert followed(box_room, greys[:35]).poses == followed(box_room, greys[:35]).poses
 
 
-def test_something_that_walks_through_the_picture_is_no_part_of_the_map(box_room, box_walk):
-    """As wide as a third of the picture, with texture of its own."""
-    walker = np.ascontiguousarray(box_walk.grey[0][:, 100:205][:, ::-1])
-    greys = []
-    for i, grey in enumerate(box_walk.grey):
-        grey, left = grey.copy(), 8 * i - 150
-        shown = slice(max(0, left), max(0, min(320, left + 105)))
-        if shown.stop > shown.start:
-            grey[:, shown] = walker[:, shown.start - left : shown.stop - left]
-        greys.append(grey)
-    tracking, views = tracked(box_room, greys)
-    assert len(views) == 60
-    assert errors(tracking, views, dict(enumerate(box_walk.poses))).max() < 0.03
+@pytest.mark.parametrize("of", ["turns", "black", "grey"])
+def test_pictures_without_parallax_or_texture_make_no_map(box_room: BoxRoom, of: str) -> None:
+    eye = np.array([-1.2, -1.2, 1.3])
+    turns = [look_at(eye, np.array([x, 3.0, 1.0])) for x in np.linspace(-1.5, 0.5, 20)]
+    greys = {"turns": [box_room.grey(T) for T in turns], "black": [BLACK] * 6, "grey": [BLACK + 90] * 6}[of]
+    found = followed(box_room, greys)
+    assert found.odometry.tracking is None and not found.views
