@@ -225,7 +225,7 @@ class Odometry:
         # The run's map, or the older one, keeps its world and its ids.
         stays, goes = other, active
         if active is self._run or (other is not self._run and self._maps.index(active) < self._maps.index(other)):
-            stays, goes, S = active, other, np.linalg.inv(S)
+            stays, goes, S = active, other, np.asarray(np.linalg.inv(S), np.float64)
         joint = stays.tracking.map.copy()
         joint.absorb(goes.tracking.map.copy(), S)
         if not connected(joint, recognitions):
