@@ -211,13 +211,13 @@ class SceneConfig(StrictModel):
     output: Path = Field(description="output folder, which is created if it does not exist")
     onto: Path | None = Field(
         default=None,
-        description="output folder of a finished run whose map this recording goes on with (docs/second_visit.md): it "
+        description="output folder of a finished run whose map this recording continues (docs/second_visit.md): it "
         "is located there, and `output` gets the map of both. The finished run stays as it is. Empty: a new map",
     )
     parts: int | None = Field(
         default=None,
         ge=2,
-        description="map the recording in so many parts, each a process of its own, and merge their maps "
+        description="map the recording in so many parts, each in a separate process, and merge their maps "
         "(docs/scale.md). Empty: as one",
     )
     force: bool = Field(
@@ -248,7 +248,7 @@ class SceneConfig(StrictModel):
     threads: int | None = Field(
         default=None,
         ge=1,
-        description="number of CPU threads; empty: one per core, and one less where `klt` follows a clock beside the "
+        description="number of CPU threads; empty: one per core, and one less where `klt` follows a clock next to the "
         "mapper",
     )
     mapping: MappingSettings = MappingSettings()

@@ -228,24 +228,15 @@ def test_frames_that_come_through_a_socket_are_checked_as_they_arrive(plane_scen
     assert codes(data) == {"inverse_poses": "unusable", "points": "unusable"}
 
 
-def test_an_input_that_cannot_be_read_is_unusable(tmp_path: Path) -> None:
-    (tmp_path / "images").mkdir()
-    code, data = checked(scene_file(tmp_path, tmp_path / "images", tmp_path / "none"))
-    assert (code, data["verdict"], codes(data)) == (2, "unusable", {"input": "unusable"})
-    assert "holds no image" in data["findings"][0]["text"]
-    code, data = checked(tmp_path / "none.yaml")
-    assert (code, codes(data)) == (2, {"input": "unusable"})
-
-
 def test_a_person_reads_a_table_a_mend_and_a_verdict(plane_scene, tmp_path: Path) -> None:
     rng = np.random.default_rng(2)
     model = plane_scene.write_colmap(np.c_[rng.uniform(-1.8, 1.8, (300, 2)), np.zeros(300)])
     planted(model, tmp_path / "fault", np.linalg.inv)
     result = CliRunner().invoke(app, ["check", str(scene_file(tmp_path, plane_scene.folder, tmp_path / "fault"))])
-    assert result.exit_code == 2
     lines = result.stdout.splitlines()
-    assert lines[-1] == "verdict: unusable"
-    assert any(line.startswith("unusable: the poses are inverted") for line in lines)
-    assert any(line.startswith("    -> give the other direction") for line in lines)
-    assert any("│ OpenGL axes" in line for line in lines)
+    assert (result.exit_code, lines[-1]) == (2, "verdict: unusable")
+    assert any(line.startswith("unusable: ") for line in lines) and any(line.startswith("    -> ") for line in lines)
     assert not (tmp_path / "out").exists()
+    for scene in (scene_file(tmp_path, tmp_path / "fault", tmp_path / "none"), tmp_path / "none.yaml"):
+        code, data = checked(scene)
+        assert (code, data["verdict"], codes(data)) == (2, "unusable", {"input": "unusable"})

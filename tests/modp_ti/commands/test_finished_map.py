@@ -127,6 +127,8 @@ def test_a_video_has_the_frames_and_the_size_that_were_asked_for(out: Path, tmp_
     assert len(pictures) == 5
     assert min(picture.std() for picture in pictures) > 10  # something is to be seen
     assert [p.name for p in tmp_path.iterdir()] == ["film.mp4"]
+    video = cv2.VideoCapture(str(done("export", out, "--format", "video", "-o", tmp_path / "recorded.mp4")))
+    assert (video.get(cv2.CAP_PROP_FRAME_COUNT), round(video.get(cv2.CAP_PROP_FPS))) == (9, 10)
 
 
 def test_a_path_of_ones_own_and_a_wider_view(out: Path, tmp_path: Path) -> None:
@@ -142,12 +144,6 @@ def test_a_path_of_ones_own_and_a_wider_view(out: Path, tmp_path: Path) -> None:
     wide = cv2.imread(str(folder / "000000.png"))[..., ::-1].astype(np.float64)
     half = cv2.resize(same, (40, 30), interpolation=cv2.INTER_AREA).astype(np.float64)
     assert np.abs(wide[15:45, 20:60] - half).mean() < 12
-
-
-def test_the_recorded_video_is_an_export_too(out: Path, tmp_path: Path) -> None:
-    video = cv2.VideoCapture(str(done("export", out, "--format", "video", "-o", tmp_path / "a.mp4")))
-    assert video.get(cv2.CAP_PROP_FRAME_COUNT) == 9
-    assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(10)
 
 
 def psnr(renderer: MapRenderer, out: Path, state: dict) -> float:
@@ -207,12 +203,6 @@ def test_every_form_of_the_splats_shows_the_same_map(out: Path, renderer: Callab
     for form, path in files.items():
         there = psnr(show, out, READERS[form](path))
         assert there > clipped if form == "splat" else abs(there - ours) <= 0.3, form
-
-
-def test_an_export_makes_the_folder_that_it_writes_into(out: Path, tmp_path: Path) -> None:
-    assert done("export", out, "--format", "points", "-o", tmp_path / "new" / "folder" / "p.ply").is_file()
-    failure("export", out, "--format", "points", "-o", tmp_path / "other" / "p.glb")
-    assert not (tmp_path / "other").exists()
 
 
 def test_the_report_links_to_the_page_of_the_map_once_it_is_there(out: Path, tmp_path: Path) -> None:
@@ -307,55 +297,38 @@ def failure(*arguments: str | Path) -> str:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "part"),
+    ("call", "named"),
     [
-        (["--format", "mesh", "-o", "m.stl"], "--format mesh writes a file in .ply, .glb, .obj"),
-        (["--format", "mesh", "--texture", "-o", "m.ply"], "m.ply: a mesh with --texture is written as .glb"),
-        (["--format", "points", "--texture"], "--texture: "),
-        (["--format", "spz", "--voxel", "0.1"], "--voxel: "),
-        (["--format", "html", "--spz-version", "3"], "--spz-version: "),
-        (["--format", "spz", "-o", "{out}/splats.ply/here.spz"], "cannot be made: "),
-        (["--format", "points", "-o", "{out}/splats.ply"], "is the map itself"),
-        (["--format", "video", "-o", "film.avi"], ".mp4, .webm"),
+        ("export --format mesh -o m.stl", "--format mesh"),
+        ("export --format mesh --texture -o m.ply", "m.ply"),
+        ("export --format points --texture", "--texture"),
+        ("export --format spz --voxel 0.1", "--voxel"),
+        ("export --format html --spz-version 3", "--spz-version"),
+        ("export --format spz -o {out}/splats.ply/here.spz", "splats.ply"),
+        ("export --format points -o {out}/splats.ply", "splats.ply"),
+        ("export --format video -o film.avi", ".mp4"),
+        ("render --path gone.txt", "gone.txt"),
+        ("render --size 640", "--size"),
+        ("render --size 5000x100", "2048"),
+        ("render --frames 5", "--frames"),
+        ("render --smooth 5", "--smooth"),
+        ("render --fps 5 -o pictures", "--fps"),
+        ("render -o {out}", "{out}"),
     ],
 )
-def test_an_export_that_cannot_be_is_refused_in_one_line(out: Path, arguments: list[str], part: str) -> None:
-    said = failure("export", out, *(a.format(out=out) for a in arguments))
-    assert said.startswith("error: ") and said.count("\n") == 1
-    assert part in said
-
-
-@pytest.mark.parametrize(
-    ("arguments", "part"),
-    [
-        (["--path", "gone.txt"], "--path gone.txt: no such file, and none of recorded, smoothed, orbit"),
-        (["--size", "640"], "write it as WIDTHxHEIGHT"),
-        (["--size", "5000x100"], "at most 2048 pixels"),
-        (["--frames", "5"], "--frames is for the paths"),
-        (["--smooth", "5"], "--smooth "),
-        (["--fps", "5", "-o", "pictures"], "--fps: "),
-        (["-o", "{out}"], "is not empty"),
-    ],
-)
-def test_a_render_that_cannot_be_is_refused_in_one_line(out: Path, arguments: list[str], part: str) -> None:
-    said = failure("render", out, *(a.format(out=out) for a in arguments))
-    assert said.startswith("error: ") and said.count("\n") == 1
-    assert part in said
-
-
-def test_an_unknown_format_is_refused_with_the_list(out: Path) -> None:
-    said = failure("export", out, "--format", "usd")
-    assert "usd" in said and "nerfstudio" in said
+def test_what_cannot_be_made_is_refused_in_one_line(out: Path, call: str, named: str) -> None:
+    command, *options = call.format(out=out).split()
+    said = failure(command, out, *options)
+    assert said.startswith("error: ") and said.count("\n") == 1 and named.format(out=out) in said
 
 
 def test_what_is_no_finished_run_is_refused(out: Path, tmp_path: Path) -> None:
-    assert "no such folder" in failure("render", tmp_path / "gone")
-    assert "no run has left anything here" in failure("render", tmp_path)
+    assert str(tmp_path / "gone") in failure("render", tmp_path / "gone")
+    assert str(tmp_path) in failure("render", tmp_path)
     broken = shutil.copytree(out, tmp_path / "broken")
-    (broken / "frames.json").unlink()
-    assert "an earlier version made it, without frames.json: run it again" in failure("render", broken)
-    (broken / "trajectory.txt").unlink()
-    assert "trajectory.txt is missing" in failure("export", broken, "--format", "mesh")
     (broken / "frames.json").write_text('{"near": 0.1, "scene_depth": 1, "keyframes": [99], "held_out": []}')
-    shutil.copy(out / "trajectory.txt", broken)
-    assert "names frames beyond the 9" in failure("render", broken)
+    assert "frames.json" in failure("render", broken)
+    for name, command in (("frames.json", ["render"]), ("trajectory.txt", ["export", "--format", "mesh"])):
+        (broken / name).unlink()
+        assert name in failure(command[0], broken, *command[1:])
+        shutil.copy(out / name, broken)
