@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from fields.runtime.engine import EngineError, engine
-from modp_ti.commands import batch, cameras, check, export, locate, refine, render, run, view, warmup
+from modp_ti.commands import batch, cameras, check, finished, run, warmup
 from modp_ti.commands.shared import BAD_INPUT, MARKUP, CommandGroup, examples
 from modp_ti.version import __version__
 
@@ -60,16 +60,14 @@ def _options(
         raise typer.Exit(BAD_INPUT)
 
 
-app.command("run", epilog=run.EXAMPLES)(run.run)
-app.command("batch", epilog=batch.EXAMPLES)(batch.batch)
-app.command("refine", epilog=refine.EXAMPLES)(refine.refine)
-app.command("cameras", epilog=cameras.EXAMPLES)(cameras.cameras)
-app.command("check", epilog=check.EXAMPLES)(check.check)
-app.command("render", epilog=render.EXAMPLES)(render.render)
-app.command("export", epilog=export.EXAMPLES)(export.export)
-app.command("locate", epilog=locate.EXAMPLES)(locate.locate)
-app.command("view", epilog=view.EXAMPLES)(view.view)
-app.command("warmup", epilog=warmup.EXAMPLES)(warmup.warmup)
+app.command(epilog=run.EXAMPLES)(run.run)
+app.command(epilog=batch.EXAMPLES)(batch.batch)
+app.command(epilog=finished.EXAMPLES["refine"])(finished.refine)
+app.command(epilog=cameras.EXAMPLES)(cameras.cameras)
+app.command(epilog=check.EXAMPLES)(check.check)
+for command in (finished.render, finished.export, finished.locate, finished.view):
+    app.command(epilog=finished.EXAMPLES[command.__name__])(command)
+app.command(epilog=warmup.EXAMPLES)(warmup.warmup)
 
 
 if __name__ == "__main__":

@@ -37,6 +37,7 @@ __all__ = [
     "CommandGroup",
     "Device",
     "Fast",
+    "OnDevice",
     "Outcome",
     "Overrides",
     "Quiet",
@@ -119,6 +120,8 @@ Address = Annotated[
     str | None,
     typer.Option(metavar="ADDRESS", help="`ray`: address of the cluster; empty: RAY_ADDRESS, or this machine"),
 ]
+
+OnDevice = Annotated[Device, typer.Option(help="`auto`: CUDA if there is a GPU, otherwise the CPU")]
 
 
 def chosen_preset(fast: bool, best: bool) -> str | None:
