@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from modp_ti.engine.mapper import Mapper as Mapper
     from modp_ti.engine.session import run_scene as run_scene
     from modp_ti.files.errors import InputError as InputError
-    from modp_ti.inputs.trackers import open_tracker as open_tracker
+    from modp_ti.inputs.opening import open_tracker as open_tracker
     from modp_ti.outputs.formats.splats_ply import read_splats as read_splats
     from modp_ti.outputs.formats.splats_ply import write_splats as write_splats
     from modp_ti.outputs.locating.locator import Location as Location
@@ -83,7 +83,7 @@ _HOMES = {
     "TrackedFrame": "fields.frames.tracked_frame",
     "initialise": "fields.runtime.backend",
     "load_scene": "modp_ti.config.scene_file",
-    "open_tracker": "modp_ti.inputs.trackers",
+    "open_tracker": "modp_ti.inputs.opening",
     "rasterize": "pipelines.render.rasterize",
     "read_splats": "modp_ti.outputs.formats.splats_ply",
     "refine": "pipelines.refinement",

@@ -157,7 +157,7 @@ def play(
     """
     from fields.frames.pose_correction import PoseCorrection
     from modp_ti.config.scene_file import load_scene
-    from modp_ti.inputs.trackers import open_tracker
+    from modp_ti.inputs.opening import open_tracker
 
     config = load_scene(scene, overrides)
     tracker = open_tracker(config)

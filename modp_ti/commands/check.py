@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from modp_ti.config.settings import SceneConfig
-    from modp_ti.inputs.trackers import Tracker
+    from modp_ti.inputs.protocol import Tracker
 
 __all__ = ["EXAMPLES", "check", "inspect_scene"]
 
@@ -69,7 +69,7 @@ def inspect_scene(config: SceneConfig, console: Console) -> dict[str, Any]:
     from modp_ti.inputs.inspection.geometry import judge_geometry, measure_geometry
     from modp_ti.inputs.inspection.report import judged, measured
     from modp_ti.inputs.inspection.survey import survey
-    from modp_ti.inputs.trackers import open_tracker
+    from modp_ti.inputs.opening import open_tracker
     from modp_ti.outputs.progress import ProgressLine
 
     line, config = ProgressLine(console), config.without_clock()

@@ -56,7 +56,7 @@ def _warmup(scene: Path | None, sizes: list[str], overrides: list[str], quiet: b
     # Imported here, so that `--help` does not wait for Taichi and the readers to load.
     from modp_ti.config.scene_file import load_scene
     from modp_ti.config.settings import SceneConfig
-    from modp_ti.config.tracker_settings import SocketSettings
+    from modp_ti.inputs.readers.socket import SocketSettings
 
     if scene is None:
         # A placeholder with default settings, of a tracker that needs no source; neither it nor the output is opened.
@@ -88,7 +88,7 @@ def compile_size(config: SceneConfig, size: tuple[int, int] | None) -> tuple[str
     from fields.geometry.camera import PinholeCamera
     from fields.runtime.backend import initialise
     from modp_ti.engine.build import EXPECTED, build_mapper
-    from modp_ti.inputs.trackers import open_tracker
+    from modp_ti.inputs.opening import open_tracker
 
     try:
         backend = initialise(config.device, config.threads, config.seed)

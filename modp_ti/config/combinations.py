@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from modp_ti.config.tracker_base_settings import GivenPosesSettings
+from modp_ti.inputs.reader import GivenPosesSettings
 
 if TYPE_CHECKING:
     from modp_ti.config.settings import SceneConfig

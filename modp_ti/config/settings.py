@@ -1,14 +1,16 @@
 """The settings of a scene as one strict model, `SceneConfig`.
 
 `modp_ti.config.scene_file` reads and writes its files. The cameras of `source` are defined in
-`modp_ti.config.camera_settings`, the `tracker` section in `modp_ti.config.tracker_settings`; `evaluation`, `export`
-and `view` in `modp_ti.config.output_settings`; `mapping`, `refine` and `offline` in `pipelines.settings`.
+`modp_ti.config.camera_settings`, the `tracker` section in `modp_ti.inputs.readers`; `evaluation`, `export` and `view`
+ in `modp_ti.config.output_settings`; `mapping`, `refine` and `offline` in `pipelines.settings`.
 """
 
 from __future__ import annotations
 
+from functools import reduce
+from operator import or_
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field, SerializationInfo, field_serializer, field_validator, model_validator
 
@@ -16,9 +18,10 @@ from fields.runtime.parallel import available_cores
 from modp_ti.config.camera_settings import BagImagesSettings, IntrinsicsSettings, PanoramaSettings, VrsSettings
 from modp_ti.config.combinations import refuse_exclusions
 from modp_ti.config.output_settings import EvaluationSettings, ExportSettings, ViewSettings
-from modp_ti.config.tracker_settings import AnyTrackerSettings
 from modp_ti.files.errors import InputError
 from modp_ti.files.urls import shown_url
+from modp_ti.inputs.reader import TrackerSettings
+from modp_ti.inputs.readers import READERS, SOURCES
 from pipelines.offline_settings import OfflineSettings
 from pipelines.settings import MappingSettings, RefineSettings, StrictModel
 
@@ -44,6 +47,15 @@ WITH_SECRETS = {"secrets": True}
 NO_PATH = "source.path is missing: set it to the folder of the images"
 
 
+# The kinds are those of the readers: a new one is a file in `modp_ti.inputs.readers`.
+if TYPE_CHECKING:
+    AnySource = str
+    AnyTracker = TrackerSettings
+else:
+    AnySource = Literal[("auto", "images", "video", "live", *SOURCES)]
+    AnyTracker = Annotated[reduce(or_, READERS.values()), Field(discriminator="kind")]
+
+
 def _written(url: int | str | None, info: SerializationInfo) -> int | str | None:
     """What is written of a URL: its secrets only for the processes of a run, which ask for them in the context."""
     return shown_url(url) if isinstance(url, str) and info.context != WITH_SECRETS else url
@@ -52,27 +64,7 @@ def _written(url: int | str | None, info: SerializationInfo) -> int | str | None
 class SourceSettings(StrictModel):
     """The source of the images, and how they are selected, scaled and masked."""
 
-    kind: Literal[
-        "auto",
-        "images",
-        "video",
-        "live",
-        "tum_rgbd",
-        "replica",
-        "sevenscenes",
-        "release",
-        "vrs",
-        "record3d",
-        "scanner_app",
-        "stray_scanner",
-        "polycam",
-        "nerfcapture",
-        "euroc",
-        "kitti",
-        "scannet",
-        "arkitscenes",
-        "bag",
-    ] = Field(
+    kind: AnySource = Field(
         default="auto",
         description="type of `path` or `stream`; `auto` detects it. `images`: a folder of images; `release`: the "
         "folder of an Aria sequence of the paper's release; `vrs`: a Project Aria recording; `bag`: a ROS bag; the "
@@ -207,7 +199,7 @@ class SceneConfig(StrictModel):
     """
 
     source: SourceSettings = SourceSettings()
-    tracker: AnyTrackerSettings
+    tracker: AnyTracker
     output: Path = Field(description="output folder, which is created if it does not exist")
     onto: Path | None = Field(
         default=None,

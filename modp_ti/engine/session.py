@@ -35,11 +35,12 @@ from modp_ti.engine.unfinished import Unfinished
 from modp_ti.files.errors import InputError
 from modp_ti.files.run_folder import run_folder
 from modp_ti.files.urls import without_secrets
-from modp_ti.inputs.ground_truth import open_ground_truth, true_poses
 from modp_ti.inputs.inspection.geometry import require_fitting
+from modp_ti.inputs.opening import open_tracker
+from modp_ti.inputs.protocol import Tracker
 from modp_ti.inputs.replay import ReplayedTracker
 from modp_ti.inputs.scene_paths import refuse_output_in_input
-from modp_ti.inputs.trackers import Tracker, open_tracker
+from modp_ti.inputs.timed_poses import open_ground_truth, true_poses
 from modp_ti.outputs.evaluation import FrameScore, MapVersion, evaluate, trajectory_errors
 from modp_ti.outputs.lpips import open_lpips
 from modp_ti.outputs.progress import ProgressLine, StageProgress, TimeAfterMapping

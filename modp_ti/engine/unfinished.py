@@ -11,7 +11,7 @@ from modp_ti.engine.mapper import Mapper
 from modp_ti.engine.results import Results
 from modp_ti.engine.snapshots import Checkpointer
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.trackers import Tracker
+from modp_ti.inputs.protocol import Tracker
 from modp_ti.outputs.evaluation import MapVersion
 from pipelines.companions.block_files import BlockError
 

@@ -17,11 +17,11 @@ from modp_ti.config.scene_file import load_scene, scene_from_data
 from modp_ti.config.settings import SceneConfig
 from modp_ti.files import exists, is_file
 from modp_ti.files.errors import InputError, UnreadableImageError
+from modp_ti.files.file_tree import ARCHIVES
 from modp_ti.files.terminal import require_text
 from modp_ti.files.urls import actual_url, shown_url
-from modp_ti.inputs.bags import SUFFIXES, has_poses
-from modp_ti.inputs.captures import ARCHIVES, KINDS
 from modp_ti.inputs.opening import is_panoramic, open_source, recognised_kind
+from modp_ti.inputs.readers import READERS, SOURCES
 from modp_ti.inputs.sources.image_folder import IMAGE_SUFFIXES, NOT_READ, ImageFolder
 from modp_ti.inputs.sources.listed_images import ListedImages
 from modp_ti.inputs.sources.video_file import VIDEO_SUFFIXES, is_video
@@ -30,22 +30,16 @@ __all__ = ["base_of", "is_recording", "named_scene", "recorded_scene", "streamed
 
 OUTPUTS = Path("out")
 SCENE = "scene.yaml"
-RECORDING_SUFFIXES = (*VIDEO_SUFFIXES, ".vrs", *ARCHIVES, *SUFFIXES)
+RECORDING_SUFFIXES = (
+    *VIDEO_SUFFIXES,
+    *ARCHIVES,
+    *(suffix for each in SOURCES.values() for suffix in each.file_suffixes),
+)
 # Longest name of an output folder [characters]. File systems take 255 bytes, and a run adds a suffix for a time.
 MAX_NAME = 60
 SCENE_SUFFIXES, PACKED = (".yaml", ".yml", ".json", ".txt"), (".tar", ".gz", ".tgz", ".bz2", ".xz", ".7z", ".rar")
-# Kind of the tracker and file of poses, by `source.kind`, in the order in which they are looked for.
-POSES = {
-    "images": (
-        *(("transforms", "transforms.json"), ("transforms", "transforms_train.json")),
-        *(("colmap", f"{top}/images.*") for top in ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")),
-        *(("tum", "groundtruth.txt"), ("tum", "*Trajectory.txt")),
-    ),
-    "tum_rgbd": (("tum", "groundtruth.txt"),),
-    "replica": (("replica", "traj.txt"),),
-    "sevenscenes": (("sevenscenes", "frame-*.pose.txt"), ("sevenscenes", "poses/frame-*.pose.txt")),
-    "release": (("modp", "trajectory.json"),),
-}
+# Kinds whose poses may lie in a folder of images, in the order in which they are looked for.
+IN_FOLDERS = ("transforms", "colmap", "tum")
 Say = Callable[[str], None]
 
 
@@ -129,21 +123,19 @@ def recorded_scene(
         scene = _scene({"path": str(images)}, output, tracker)
         return scene_from_data(scene, str(path), [*overrides, *more], preset)
 
-    if kind in KINDS or (kind == "bag" and has_poses(path)):
-        return settings({"kind": kind})
+    kinds = IN_FOLDERS if kind == "images" else [SOURCES[kind].model_fields["kind"].default] if kind in SOURCES else []
+    found = next(((each, *poses) for each in kinds if (poses := READERS[each].poses_of(path)) is not None), None)
+    if found is not None and found[2] == path:  # the recording itself brings them
+        return settings({"kind": found[0], **found[1]})
     config = settings({"kind": "klt"})
     if any(override.strip().startswith("tracker.") for override in overrides):
         return config
-    for tracker, pattern in POSES.get(kind, ()):
-        file = next(path.glob(pattern), None)
-        if file is None:
-            continue
-        if tracker == "tum" and not (config.source.intrinsics.given or _is_calibrated(config)):
-            say(f"{file} is not used without source.intrinsics (tracker.kind=tum): klt tracks the images")
-            break
-        say(f"the poses of {file} are used; tracker.kind=klt would track the images alone")
-        given = {} if tracker == "sevenscenes" else {"path": str(file.parent if tracker == "colmap" else file)}
-        return settings({"kind": tracker, **given})
+    if found is not None:
+        tracker, given, file = found
+        if tracker != "tum" or config.source.intrinsics.given or _is_calibrated(config):
+            say(f"the poses of {file} are used; tracker.kind=klt would track the images alone")
+            return settings({"kind": tracker, **given})
+        say(f"{file} is not used without source.intrinsics (tracker.kind=tum): klt tracks the images")
     if kind == "images" and not config.source.panorama.model_fields_set:
         first = ImageFolder(images).names[:1]
         with suppress(UnreadableImageError):

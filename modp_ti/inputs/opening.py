@@ -1,24 +1,15 @@
-"""Opens the configured images, by their kind."""
+"""Opens the configured images and the configured tracker, by their kind."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from modp_ti.config.settings import SourceSettings
 from modp_ti.files.errors import InputError, UnreadableImageError
+from modp_ti.files.file_tree import ARCHIVES, open_tree
+from modp_ti.files.reading import reading
 from modp_ti.files.urls import actual_url
-from modp_ti.inputs.bags import is_bag
-from modp_ti.inputs.captures import ARCHIVES, recognised_capture
-from modp_ti.inputs.captures.images import open_capture_images
-from modp_ti.inputs.sources.data_sets import (
-    RELEASE_IMAGES,
-    find_replica_images,
-    find_sevenscenes_images,
-    open_release,
-    open_replica,
-    open_sevenscenes,
-)
+from modp_ti.inputs.protocol import Progress, Tracker
 from modp_ti.inputs.sources.faces import PanoramaFaces
 from modp_ti.inputs.sources.image_folder import ImageFolder
 from modp_ti.inputs.sources.intrinsics import given_intrinsics
@@ -26,10 +17,12 @@ from modp_ti.inputs.sources.listed_images import ListedImages
 from modp_ti.inputs.sources.paced import PacedSource
 from modp_ti.inputs.sources.panorama import looks_panoramic
 from modp_ti.inputs.sources.protocol import ImageSource
-from modp_ti.inputs.sources.tum_rgbd import open_tum_rgbd
 from modp_ti.inputs.sources.video_file import VIDEO_SUFFIXES, VideoFile, is_video
 
-__all__ = ["is_panoramic", "open_source", "recognised_kind", "require_pinhole"]
+if TYPE_CHECKING:
+    from modp_ti.config.settings import SceneConfig, SourceSettings
+
+__all__ = ["is_panoramic", "open_source", "open_tracker", "recognised_kind", "require_pinhole"]
 
 
 def open_source(source: SourceSettings, folder: Path | None = None) -> ImageSource:
@@ -56,16 +49,45 @@ def open_source(source: SourceSettings, folder: Path | None = None) -> ImageSour
             raise
     path = source.require_path()
     kind = recognised_kind(path) if source.kind == "auto" else source.kind
-    if kind in _OPENERS:
-        images = _OPENERS[kind](path, source)
+    if kind == "images":
+        images: ImageSource = ImageFolder(path, source.fps, masks=source.masks)
+    elif kind == "video":
+        images = VideoFile(path, source.fps, source.stop)
     else:
-        images = open_capture_images(path, kind, source.fps, source.stop)
-    if source.kind == "auto" and kind not in ("images", "video", "vrs", "bag"):
-        images.add_note(f"{path} is read as what `source.kind: {kind}` says", first=True)
+        from modp_ti.inputs.readers import SOURCES  # here, since readers open sources themselves
+
+        images = SOURCES[kind].open_images(path, source)
+        if source.kind == "auto" and not SOURCES[kind].file_suffixes:
+            images.add_note(f"{path} is read as what `source.kind: {kind}` says", first=True)
     if source.panorama.given:
         return _scaled(PanoramaFaces(images, source.panorama), source)
     images = _scaled(_with_camera(images, source), source)
     return PacedSource(images) if source.realtime else images
+
+
+def open_tracker(config: SceneConfig, progress: Progress | None = None) -> Tracker:
+    """Open the configured tracker. Its input is checked as far as possible without decoding all images.
+
+    Args:
+        config: The scene configuration. Only `source`, `tracker` and `seed` are used, and `output` by `sfm`.
+        progress: Called while the tracker prepares, for example while it triangulates points.
+
+    Raises:
+        InputError: If the input is invalid.
+
+    Example:
+        for frame in modp_ti.open_tracker(modp_ti.load_scene("scene.yaml")):
+            print(frame.name, len(frame.points))
+    """
+    of_tracker = dict(config.tracker).get("path")
+    with reading(of_tracker or config.source.path or "source.stream"):
+        tracker = config.tracker.open(config, progress)
+    if config.source.part is None:
+        return tracker
+    from modp_ti.inputs.replay import ReplayedTracker
+
+    assert isinstance(tracker, ReplayedTracker), "SceneConfig refuses parts of other recordings"
+    return tracker.within(*config.source.part)
 
 
 def is_panoramic(images: ImageSource, name: str) -> bool:
@@ -101,63 +123,26 @@ def recognised_kind(path: Path) -> str:
     Raises:
         InputError: If the path is a file of an unknown type.
     """
-    if is_bag(path):
-        return "bag"
+    from modp_ti.inputs.readers import SOURCES  # here, since readers open sources themselves
+
     suffix = path.suffix.lower()
-    if not path.is_dir():
-        if suffix in ARCHIVES and path.exists():
-            kind = recognised_capture(path)
-            if kind is None:
-                raise InputError(f"{path}: is no capture of a known app; unpack it and name the folder of the images")
-            return kind
-        if suffix == ".vrs":
-            return "vrs"
-        if suffix in VIDEO_SUFFIXES or (path.exists() and is_video(path)):
-            return "video"
+    is_archive = suffix in ARCHIVES and path.is_file()
+    if not path.is_dir() and not is_archive:
+        named = [kind for kind, reader in SOURCES.items() if suffix in reader.file_suffixes]
+        if named or suffix in VIDEO_SUFFIXES or (path.exists() and is_video(path)):
+            return named[0] if named else "video"
         if path.exists():
             raise InputError(
                 f"{path}: is neither a folder of images nor a file that {suffix or 'its missing suffix'} tells to be a "
                 "video or a VRS recording; where it is a video, set source.kind: video"
             )
         return "images"
-    if (kind := recognised_capture(path)) is not None:
-        return kind
-    if (path / "rgb.txt").is_file():
-        return "tum_rgbd"
-    if find_replica_images(path):
-        return "replica"
-    if find_sevenscenes_images(path):
-        return "sevenscenes"
-    if (path / RELEASE_IMAGES).is_dir():
-        return "release"
-    return "images"
-
-
-def _open_vrs(path: Path, source: SourceSettings) -> ImageSource:
-    # Imported here: projectaria-tools is an extra.
-    from modp_ti.inputs.sources.aria_vrs import AriaRecording
-
-    return AriaRecording(path, source.vrs, source.vignette)
-
-
-def _open_bag(path: Path, source: SourceSettings) -> ImageSource:
-    # Imported here: bags need libraries of their own.
-    from modp_ti.inputs.bags.images import BagImages
-
-    return BagImages(path, source.bag, source.stop, calibrated=not source.intrinsics.given)
-
-
-_OPENERS: dict[str, Callable[[Path, SourceSettings], ImageSource]] = {
-    "images": lambda path, source: ImageFolder(path, source.fps, masks=source.masks),
-    "video": lambda path, source: VideoFile(path, source.fps, source.stop),
-    "tum_rgbd": lambda path, _: open_tum_rgbd(path),
-    "replica": lambda path, source: open_replica(path, source.fps),
-    "sevenscenes": lambda path, source: open_sevenscenes(path, source.fps),
-    "release": lambda path, source: open_release(path, source.fps, own_vignette=source.vignette is None),
-    "vrs": _open_vrs,
-    "bag": _open_bag,
-}
-"""Functions that open a path, by `source.kind`; the other kinds are captures."""
+    trees = open_tree(path)
+    found = [kind for tree in trees for kind, reader in SOURCES.items() if reader.recognises(tree)]
+    trees[0].close()
+    if is_archive and not found:
+        raise InputError(f"{path}: is no capture of a known app; unpack it and name the folder of the images")
+    return found[0] if found else "images"
 
 
 def _with_camera(images: ImageSource, source: SourceSettings) -> ImageSource:

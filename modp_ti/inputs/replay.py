@@ -6,17 +6,19 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fields.frames.origin import far_origin
 from fields.frames.tracked_frame import SparsePoints, TrackedFrame
-from modp_ti.config.settings import SourceSettings
 from modp_ti.files.errors import FEW, InputError, UnreadableImageError
 from modp_ti.inputs.protocol import Tracker
 from modp_ti.inputs.sources import FrameReader, ImageSource, Undistorter
+
+if TYPE_CHECKING:
+    from modp_ti.config.settings import SourceSettings
 
 __all__ = [
     "ALL_HELD_OUT",

@@ -10,9 +10,10 @@ from pathlib import Path
 from pydantic import BaseModel
 
 from modp_ti.config.settings import SceneConfig
-from modp_ti.config.tracker_settings import SocketSettings
 from modp_ti.files.errors import InputError
 from modp_ti.files.run_folder import is_run_folder
+from modp_ti.inputs.opening import recognised_kind
+from modp_ti.inputs.readers.socket import SocketSettings
 
 __all__ = ["refuse_output_in_input"]
 
@@ -63,8 +64,6 @@ def _paths(model: BaseModel, start: str) -> Iterator[tuple[str, Path]]:
 
 
 def _is_read_whole(setting: str, config: SceneConfig) -> bool:
-    from modp_ti.inputs.opening import recognised_kind  # here, as readers of all kinds come with it
-
     source = config.source
     if setting == "source.path" and source.path is not None:
         return (recognised_kind(source.path) if source.kind == "auto" else source.kind) == "images"

@@ -20,8 +20,8 @@ from fields.geometry.se3 import exp_se3
 from modp_ti.files import parse_json
 from modp_ti.files.csv_columns import read_csv_blocks
 from modp_ti.files.number_rows import read_number_rows
+from modp_ti.inputs.point_cloud import read_ply_points
 from modp_ti.inputs.tracker_server.messages import Kind, State, encoded, parse_correction, parse_frame
-from modp_ti.inputs.trackers.point_cloud import read_ply_points
 from modp_ti.outputs.evaluation import FrameScore
 from modp_ti.outputs.formats.run_files import read_frames, read_scores, write_frames, write_scores
 from modp_ti.outputs.formats.splats_ply import read_splats, write_splats

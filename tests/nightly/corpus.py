@@ -17,7 +17,7 @@ import pytest
 
 from modp_ti.config.scene_file import load_scene
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.trackers import open_tracker
+from modp_ti.inputs.opening import open_tracker
 from tests.fault_injection.samples import SAMPLES, write_sample
 from tests.modp_ti.inputs.tracker_server.clients import connect, opened
 

@@ -8,11 +8,11 @@ from pathlib import Path
 
 from modp_ti.config.scene_file import dump_scene, load_scene
 from modp_ti.config.settings import SceneConfig
-from modp_ti.config.tracker_settings import SocketSettings
 from modp_ti.engine.snapshots.file import FILE as SNAPSHOT
 from modp_ti.files.errors import InputError
 from modp_ti.files.run_folder import list_files
 from modp_ti.inputs.protocol import Tracker
+from modp_ti.inputs.readers.socket import SocketSettings
 from modp_ti.inputs.sources.frame_store import list_frames
 
 __all__ = ["FILE", "Recovery", "discard", "recovered"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from modp_ti.inputs.captures.capture import checked_numbers, plausible_camera
+from modp_ti.inputs.capture import checked_numbers, plausible_camera
 from modp_ti.inputs.sources.distortion import NO_DISTORTION, lens_of_model
 from modp_ti.inputs.sources.intrinsics import Intrinsics
 

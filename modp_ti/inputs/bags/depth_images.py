@@ -5,25 +5,27 @@ from __future__ import annotations
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fields.frames.tracked_frame import IDS_PER_FRAME, SparsePoints
-from modp_ti.config.capture_settings import BagSettings
 from modp_ti.files.errors import FEW, InputError
 from modp_ti.inputs.bags.bag import IMAGES, INFO, Bag, Place
 from modp_ti.inputs.bags.camera_info import camera_of_info, info_beside, is_rectified
 from modp_ti.inputs.bags.frame_tree import clean, seconds
 from modp_ti.inputs.bags.pictures import is_compressed, is_depth, picture_size, stored_values
-from modp_ti.inputs.captures.capture import DepthMap
-from modp_ti.inputs.captures.depth_maps import sampled_points
+from modp_ti.inputs.capture import DepthMap
+from modp_ti.inputs.depth_maps import sampled_points
 from modp_ti.inputs.protocol import Progress
 from modp_ti.inputs.replay import PosedImage, points_inside
 from modp_ti.inputs.sources.image_header import why_undecodable
 from modp_ti.inputs.sources.image_pixels import decoded_as
 from modp_ti.inputs.sources.intrinsics import Intrinsics
+
+if TYPE_CHECKING:
+    from modp_ti.inputs.readers.bag import BagSettings
 
 __all__ = ["DepthTopic", "depth_metres", "depth_topics", "read_depth_topic", "with_depth_points"]
 

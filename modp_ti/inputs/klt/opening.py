@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fields.geometry.camera import PinholeCamera
-from modp_ti.config.settings import SourceSettings
-from modp_ti.config.tracker_settings import KltSettings
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.klt.camera import (
     ADVICE,
@@ -27,9 +26,13 @@ from modp_ti.inputs.klt.selected_images import available, followed_scale, read_i
 from modp_ti.inputs.klt.tracker import KltTracker
 from modp_ti.inputs.opening import open_source, require_pinhole
 from modp_ti.inputs.protocol import Progress
+from modp_ti.inputs.readers.klt import KltSettings
 from modp_ti.inputs.replay import readable_sizes
 from modp_ti.inputs.sources import FrameReader, ImageSource, Intrinsics, require_intrinsics
 from modp_ti.inputs.sources.image_header import focal_length_35mm
+
+if TYPE_CHECKING:
+    from modp_ti.config.settings import SourceSettings
 
 __all__ = ["estimated_intrinsics", "open_klt"]
 

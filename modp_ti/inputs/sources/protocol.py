@@ -17,7 +17,7 @@ from modp_ti.inputs.sources.intrinsics import Intrinsics
 from modp_ti.inputs.sources.orientation import AS_STORED, Turn
 
 if TYPE_CHECKING:
-    from modp_ti.inputs.captures.capture import Capture
+    from modp_ti.inputs.capture import Capture
     from modp_ti.inputs.sources.backlog import Arrivals
 
 __all__ = ["IMAGE_SUFFIXES", "ImageSource", "require_intrinsics"]

@@ -7,6 +7,7 @@ import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +32,9 @@ from modp_ti.inputs.tracker_server.messages import (
     parse_points,
 )
 from modp_ti.inputs.tracker_server.recorded_stream import FRAMES, STREAM
+
+if TYPE_CHECKING:
+    from modp_ti.config.settings import SourceSettings
 
 __all__ = ["Spool", "SpoolFullError"]
 

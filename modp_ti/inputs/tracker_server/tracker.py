@@ -8,13 +8,12 @@ from functools import partial
 from queue import Empty, Full, Queue
 from socket import socket
 from threading import Event, Thread
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
-from modp_ti.config.settings import SourceSettings
-from modp_ti.config.tracker_settings import SocketSettings
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.live_counts import LiveCounts
 from modp_ti.inputs.protocol import Progress, Tracker
@@ -36,6 +35,10 @@ from modp_ti.inputs.tracker_server.messages import (
 from modp_ti.inputs.tracker_server.ordering import Ordering
 from modp_ti.inputs.tracker_server.recorded_stream import is_stream, send_again
 from modp_ti.inputs.tracker_server.spool import Spool, SpoolFullError
+
+if TYPE_CHECKING:
+    from modp_ti.config.settings import SourceSettings
+    from modp_ti.inputs.readers.socket import SocketSettings
 
 __all__ = ["TrackerServer", "open_tracker_server"]
 

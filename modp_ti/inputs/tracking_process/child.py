@@ -13,12 +13,12 @@ import cv2
 
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
-from modp_ti.config.tracker_settings import KltSettings
 from modp_ti.files.ending_signals import left_to_parent
 from modp_ti.files.errors import InputError
 from modp_ti.files.terminal import own_terminal
 from modp_ti.inputs.klt import KltTracker, open_klt
 from modp_ti.inputs.opening import open_source
+from modp_ti.inputs.readers.klt import KltSettings
 from modp_ti.inputs.sources import FrameReader, ImageSource, Undistorter
 from modp_ti.inputs.tracking_process.frame_record import FrameRecord
 from modp_ti.inputs.tracking_process.frame_ring import CountsBoard, FrameRing, SlotLayout

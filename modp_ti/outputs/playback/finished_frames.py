@@ -6,11 +6,9 @@ from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing
 from dataclasses import replace
 
-import numpy as np
-
 from fields.frames.origin import shifted
 from fields.frames.tracked_frame import SparsePoints, TrackedFrame
-from modp_ti.inputs.trackers.colmap_files import read_colmap_model
+from modp_ti.inputs.colmap_model import read_colmap_model
 from modp_ti.outputs.playback.finished_run import FinishedRun
 from modp_ti.outputs.playback.run_pictures import Preparing, pictures
 
@@ -34,15 +32,12 @@ class FinishedFrames:
         self._run = run
         self._preparing = preparing
         model = read_colmap_model(run.folder / "colmap")
-        place = {number: point.xyz for number, point in model.points3D.items()}
         self._points = []
         for number, camera in zip(sorted(model.images), run.cameras, strict=True):
-            seen = model.images[number].get_observation_points2D()
-            ids = np.array([point.point3D_id for point in seen], dtype=np.int64)
-            pixels = np.array([point.xy for point in seen], dtype=np.float64).reshape(-1, 2)
-            xyz = np.array([place[i] for i in ids.tolist()], dtype=np.float64).reshape(-1, 3)
-            inside = camera.contains(pixels)
-            self._points.append(SparsePoints(xyz[inside], pixels[inside], -ids[inside]))
+            image = model.images[number]
+            inside = camera.contains(image.pixels)
+            ids = image.ids[inside]
+            self._points.append(SparsePoints(model.positions(ids), image.pixels[inside], -ids))
 
     def __len__(self) -> int:
         return len(self._run)

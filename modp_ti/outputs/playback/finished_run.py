@@ -14,9 +14,10 @@ from fields.geometry.camera import PinholeCamera
 from modp_ti.files.errors import InputError
 from modp_ti.files.reading import reading
 from modp_ti.files.run_folder import require_whole
+from modp_ti.inputs.colmap_model import read_colmap_model
 from modp_ti.inputs.sources import NO_DISTORTION
 from modp_ti.inputs.sources.intrinsics import require_plausible
-from modp_ti.inputs.trackers.colmap_files import read_colmap_model
+from modp_ti.inputs.colmap_model import read_colmap_model
 from modp_ti.outputs.formats.run_files import FramesRecord, read_frames
 from modp_ti.outputs.formats.splats_ply import read_splats
 from modp_ti.outputs.formats.trajectory import read_trajectory
@@ -132,4 +133,4 @@ def _read_model(folder: Path) -> tuple[list[str], list[PinholeCamera]]:
         parts = PurePosixPath(image.name).parts
         if not parts or parts[0] == "/" or ".." in parts or "\0" in image.name:
             raise InputError(f"{folder}: image {image.name!r} is no name below the folder of images")
-    return [image.name for image in images], [of_id[image.camera_id] for image in images]
+    return [image.name for image in images], [of_id[image.camera] for image in images]

@@ -13,13 +13,11 @@ import numpy as np
 from fields.geometry.camera import PinholeCamera
 from modp_ti.config.scene_file import load_scene
 from modp_ti.config.settings import SceneConfig
-from modp_ti.config.tracker_settings import TransformsSettings
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.opening import open_source
+from modp_ti.inputs.opening import open_source, open_tracker
+from modp_ti.inputs.readers.transforms import TransformsSettings, masks_of_transforms
 from modp_ti.inputs.sources import FrameReader, Picture, Undistorter
 from modp_ti.inputs.sources.intrinsics import Intrinsics
-from modp_ti.inputs.trackers import open_tracker
-from modp_ti.inputs.trackers.transforms import masks_of_transforms
 from modp_ti.outputs.playback.finished_run import FinishedRun, open_run
 
 __all__ = ["kept_images", "pictures", "run_settings"]

@@ -13,7 +13,7 @@ from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import inverse_se3
 from modp_ti.config.settings import ViewSettings
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.trackers.colmap_files import read_colmap_model
+from modp_ti.inputs.colmap_model import read_colmap_model
 from modp_ti.outputs.formats.run_files import read_exposures
 from modp_ti.outputs.playback.finished_run import FinishedRun
 from modp_ti.outputs.playback.map_renderer import MapRenderer, eight_bits, start_device
@@ -153,6 +153,5 @@ def _tracked_points(run: FinishedRun) -> NDArray[np.float64]:
     """Return at most MAX_POINTS points (N, 3) of the run's COLMAP model near its splats. None of a file of splats."""
     if not run.folder.is_dir():
         return np.zeros((0, 3))
-    points = read_colmap_model(run.folder / "colmap").points3D
-    xyz = np.array([points[number].xyz for number in sorted(points)]).reshape(-1, 3) - run.record.origin
+    xyz = read_colmap_model(run.folder / "colmap").xyz - run.record.origin
     return xyz if len(xyz) <= MAX_POINTS else xyz[np.arange(MAX_POINTS) * len(xyz) // MAX_POINTS]

@@ -19,14 +19,15 @@ from typer.testing import CliRunner, Result
 
 from modp_ti.commands.app import app
 from modp_ti.config.settings import SourceSettings
-from modp_ti.config.tracker_settings import TransformsSettings
-from modp_ti.inputs.trackers.transforms import open_transforms
+from modp_ti.inputs.readers.transforms import TransformsSettings
+from tests.opening import opened_with
 from modp_ti.outputs.formats.run_files import write_exposures
 from modp_ti.outputs.formats.splats_ply import read_splats
 from modp_ti.outputs.formats.trajectory import read_trajectory, write_trajectory
 from modp_ti.outputs.playback.finished_run import open_run
 from modp_ti.outputs.playback.map_renderer import MapRenderer
 from tests.modp_ti.outputs.formats.splat_readers import READERS
+from tests.opening import opened_with
 from tests.room import HIGH, LOW
 
 DEFAULTS = {
@@ -282,7 +283,7 @@ def test_a_nerfstudio_data_set_is_read_by_our_own_reader_and_has_its_split(out: 
     assert not set(data["train_filenames"]) & set(data["test_filenames"])
     assert PlyData.read(folder / data["ply_file_path"])["vertex"].count > 100
     source, tracker = SourceSettings(path=folder / "images"), TransformsSettings(path=folder)
-    frames = list(open_transforms(source, tracker))
+    frames = list(opened_with(source, tracker))
     run = open_run(out)
     for frame, T, camera in zip(frames, run.poses, run.cameras, strict=True):
         np.testing.assert_allclose(frame.T_camera_world, T, atol=1e-9)

@@ -15,7 +15,7 @@ from fields.frames.pose_correction import PoseCorrection
 from fields.geometry.se3 import camera_centres
 from fields.runtime.backend import initialise
 from modp_ti.engine.mapper import Mapper
-from modp_ti.inputs.trackers.point_cloud import read_ply_points
+from modp_ti.inputs.point_cloud import read_ply_points
 from modp_ti.outputs.formats.splats_ply import read_splats
 from modp_ti.outputs.formats.trajectory import read_trajectory
 from modp_ti.outputs.playback.export_map import ExportOptions, export_map

@@ -25,8 +25,9 @@ from modp_ti.engine import session
 from modp_ti.engine.build import build_mapper
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.delivered_frames import DeliveredFrames
+from modp_ti.inputs.opening import open_tracker
+from modp_ti.inputs.protocol import Tracker
 from modp_ti.inputs.replay import ReplayedTracker
-from modp_ti.inputs.trackers import Tracker, open_tracker
 from modp_ti.outputs.evaluation import summary
 from modp_ti.outputs.formats.run_files import read_scores
 from modp_ti.outputs.formats.splats_ply import read_splats

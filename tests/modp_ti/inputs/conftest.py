@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from modp_ti.config.settings import SceneConfig
 from modp_ti.files.errors import InputError
+from modp_ti.inputs.opening import open_tracker
 from modp_ti.inputs.replay import ReplayedTracker
-from modp_ti.inputs.trackers import open_tracker
 
 
 @dataclass(frozen=True)

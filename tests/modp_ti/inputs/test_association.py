@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from modp_ti.inputs.association import associate
+from modp_ti.inputs.timed_poses import associate
 
 
 def by_hand(a, b, max_difference):

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.ground_truth import open_ground_truth, true_poses
 from modp_ti.inputs.protocol import Before
+from modp_ti.inputs.timed_poses import open_ground_truth, true_poses
 from modp_ti.outputs.evaluation import absolute_trajectory_error
 
 

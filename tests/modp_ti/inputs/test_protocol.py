@@ -10,7 +10,7 @@ import pytest
 from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from modp_ti.commands.check import _lens
-from modp_ti.inputs.trackers import Tracker
+from modp_ti.inputs.protocol import Tracker
 
 
 class Plain(Tracker):

@@ -12,13 +12,13 @@ from scipy.spatial.transform import Rotation
 
 from fields.geometry.camera import PinholeCamera
 from modp_ti.config.settings import SourceSettings
-from modp_ti.config.tracker_settings import ColmapSettings, TransformsSettings
 from modp_ti.files.errors import InputError
 from modp_ti.files.trajectory import checked_pose
+from modp_ti.inputs.readers.colmap import ColmapSettings
+from modp_ti.inputs.readers.transforms import TransformsSettings
 from modp_ti.inputs.replay import points_inside
 from modp_ti.inputs.sources import Undistorter
-from modp_ti.inputs.trackers.colmap import open_colmap
-from modp_ti.inputs.trackers.transforms import open_transforms
+from tests.opening import opened_with
 
 
 def test_nearly_rigid_pose_becomes_the_nearest_rigid_one():
@@ -59,14 +59,14 @@ def test_masks_of_the_source_reach_the_frames_and_take_their_points_away(plane_s
     source = {"path": plane_scene.folder, "scale": 0.5}
     if kind == "colmap":
         plane_scene.write_colmap(xyz)
-        opened = partial(open_colmap, tracker=ColmapSettings())
+        opened = partial(opened_with, tracker=ColmapSettings())
     else:
         rows = "\n".join(" ".join(map(repr, row)) for row in xyz.tolist())
         properties = "".join(f"property double {axis}\n" for axis in "xyz")
         header = f"ply\nformat ascii 1.0\nelement vertex {len(xyz)}\n{properties}end_header\n"
         (plane_scene.folder.parent / "points.ply").write_text(f"{header}{rows}\n")
         plane_scene.write_transforms(ply_file_path="points.ply", k1=-0.15)
-        opened = partial(open_transforms, tracker=TransformsSettings())
+        opened = partial(opened_with, tracker=TransformsSettings())
     plain = list(opened(SourceSettings(**source)))
     masked = list(opened(SourceSettings(**source, masks=masks, mask_colour=(255, 0, 0))))
     lost = 0
@@ -98,7 +98,7 @@ def test_a_missing_mask_ends_the_run_before_the_points_are_triangulated(plane_sc
     cv2.imwrite(str(masks / plane_scene.names[0]), np.full(plane_scene.size[::-1], 255, np.uint8))
     plane_scene.write_transforms()
     with pytest.raises(InputError, match=r"has no mask for view9\.png"):
-        open_transforms(
+        opened_with(
             SourceSettings(path=plane_scene.folder, masks=masks),
             TransformsSettings(),
             lambda *_: pytest.fail("it began"),

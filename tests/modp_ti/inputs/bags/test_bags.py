@@ -18,7 +18,7 @@ from modp_ti.inputs.bare_recording import recorded_scene
 from modp_ti.inputs.inspection.geometry import judge_geometry, measure_geometry
 from modp_ti.inputs.inspection.survey import survey
 from modp_ti.inputs.opening import open_source
-from modp_ti.inputs.trackers import bag as bag_tracker
+from modp_ti.inputs.readers import bag as bag_tracker
 from tests.bags import BODY_CAMERA, FORMS, OPTICAL, START, STEP, Messages, recording, write_bag
 
 PLANE = np.stack(np.meshgrid(np.linspace(-3, 3, 40), np.linspace(-3, 3, 40), [0.0]), axis=-1).reshape(-1, 3)

@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from fields.runtime.backend import initialise
 from modp_ti.config.settings import SceneConfig
 from modp_ti.engine.mapper import Mapper
+from modp_ti.inputs.opening import open_tracker
 from modp_ti.inputs.protocol import Tracker
-from modp_ti.inputs.trackers import open_tracker
 from pipelines.settings import MappingSettings
 from tests.bags import FORMS, START, STEP, Messages, recording, write_bag
 

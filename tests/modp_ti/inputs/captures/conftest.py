@@ -11,8 +11,8 @@ import pytest
 from numpy.typing import NDArray
 
 from modp_ti.config.settings import SceneConfig
+from modp_ti.inputs.opening import open_tracker
 from modp_ti.inputs.replay import ReplayedTracker
-from modp_ti.inputs.trackers import open_tracker
 from tests.captures import View
 
 __all__ = ["Opened"]

@@ -12,15 +12,15 @@ from typer.testing import CliRunner
 from modp_ti.commands import app as cli
 from modp_ti.config.settings import SourceSettings
 from modp_ti.files.errors import InputError
+from modp_ti.inputs import capture_reader
 from modp_ti.inputs.bare_recording import recorded_scene
-from modp_ti.inputs.captures import KINDS, recognised_capture
 from modp_ti.inputs.inspection.conventions import STATED
 from modp_ti.inputs.inspection.geometry import judge_geometry, measure_geometry
 from modp_ti.inputs.inspection.survey import survey
-from modp_ti.inputs.opening import open_source
+from modp_ti.inputs.opening import open_source, open_tracker, recognised_kind
 from modp_ti.inputs.replay import ReplayedTracker
-from modp_ti.inputs.trackers import captures, open_tracker
 from tests.captures import OPENGL, WRITERS, View, zipped
+from tests.opening import CAPTURES
 
 WITH_DEPTH = ("record3d", "scanner_app", "stray_scanner", "polycam", "scannet", "arkitscenes")
 ARCHIVED = ("record3d", "polycam", "nerfcapture")
@@ -110,19 +110,19 @@ def test_an_archive_is_the_same_as_its_folder(kind, top, views, tmp_path, opened
 @pytest.mark.parametrize("kind", WRITERS)
 def test_a_folder_alone_is_recognised_and_tracked_by_its_own_poses(kind, views, tmp_path):
     WRITERS[kind](tmp_path / kind, views[:2])
-    assert recognised_capture(tmp_path / kind) == kind
+    assert recognised_kind(tmp_path / kind) == kind
     assert recorded_scene(tmp_path / kind).tracker.kind == kind
     assert recorded_scene(tmp_path / kind, ["tracker.kind=klt"]).tracker.kind == "klt"
 
 
 def test_every_kind_is_written_by_a_test():
-    assert set(WRITERS) == set(KINDS)
+    assert set(WRITERS) == set(CAPTURES)
 
 
 @pytest.mark.parametrize("kind", WRITERS)
 def test_a_wrong_axes_convention_is_found_by_check(kind, views, tmp_path, monkeypatch, opened):
     """The images tell it: points of depth maps fit the poses whatever these are. Triangulation would take seconds."""
-    monkeypatch.setattr(captures, "triangulated_frames", lambda _, frames, *__: frames)
+    monkeypatch.setattr(capture_reader, "triangulated_frames", lambda _, frames, *__: frames)
     needs_lzfse(kind)
     flipped = [replace(view, T_world_camera=view.T_world_camera @ OPENGL) for view in views[:4]]
     WRITERS[kind](tmp_path / kind, flipped)

@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 import pytest
 
-from modp_ti.inputs.captures import read_capture
-from modp_ti.inputs.captures.depth_maps import read_millimetres
+from modp_ti.inputs import capture_reader, given_poses
+from modp_ti.inputs.depth_maps import read_millimetres
 from modp_ti.inputs.inspection.conventions import STATED
 from modp_ti.inputs.inspection.geometry import measure_geometry
 from modp_ti.inputs.inspection.survey import survey
-from modp_ti.inputs.trackers import captures, given_poses
+from tests.opening import read_capture
 
 pytestmark = pytest.mark.real_data
 
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.real_data
 @pytest.fixture
 def untriangulated(monkeypatch):
     """The poses alone are looked at."""
-    monkeypatch.setattr(captures, "triangulated_frames", lambda _, frames, *__: frames)
+    monkeypatch.setattr(capture_reader, "triangulated_frames", lambda _, frames, *__: frames)
 
 
 def test_points_of_3d_scanner_app_lie_where_another_frame_measures_them(shared_data, opened):

@@ -15,9 +15,9 @@ from scipy.spatial.transform import Rotation
 from modp_ti.config.settings import SourceSettings
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.bare_recording import recorded_scene
-from modp_ti.inputs.captures import read_capture
 from modp_ti.inputs.opening import open_source
 from tests.captures import KITTI_OFFSET, WRITERS, View, exr_file, lzfse_stored, zipped
+from tests.opening import read_capture
 
 
 def changed(file: Path, change) -> None:

@@ -10,8 +10,8 @@ from fields.geometry.se3 import exp_se3
 from modp_ti.config.settings import SceneConfig
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.inspection.geometry import require_fitting
+from modp_ti.inputs.opening import open_tracker
 from modp_ti.inputs.replay import ReplayedTracker
-from modp_ti.inputs.trackers import open_tracker
 
 
 def tracked(scene, poses: np.ndarray, wxyz: bool = False) -> ReplayedTracker:

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from typing import get_args
-
 import cv2
 import numpy as np
 import pytest
 
 from modp_ti.config.settings import SourceSettings
 from modp_ti.files.errors import InputError
-from modp_ti.inputs import captures
-from modp_ti.inputs.opening import _OPENERS, open_source
+from modp_ti.inputs.opening import open_source
 from modp_ti.inputs.sources import ImageFolder, ImageSource
 
 
@@ -35,12 +32,6 @@ def test_notes_are_added_behind_the_others_or_before_them(images):
     images.add_note("first", first=True)
     images.add_note("third")
     assert images.notes == ["first", "second", "third"]
-
-
-def test_every_kind_that_lies_in_files_has_an_opener():
-    kinds = get_args(SourceSettings.model_fields["kind"].annotation)
-    assert set(_OPENERS) | set(captures.KINDS) == set(kinds) - {"auto", "live"}
-    assert not set(_OPENERS) & set(captures.KINDS)
 
 
 def test_a_source_without_a_path_is_asked_for_one():

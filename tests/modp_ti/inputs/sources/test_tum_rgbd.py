@@ -9,9 +9,13 @@ import pytest
 from modp_ti.config.settings import SourceSettings
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.opening import open_source
-from modp_ti.inputs.sources.tum_rgbd import open_tum_rgbd
+from modp_ti.inputs.readers.tum import TumSettings
 
 IMAGE = np.zeros((480, 640, 3), np.uint8)
+
+
+def opened(folder):
+    return TumSettings.open_images(folder, SourceSettings(path=folder))
 
 
 @pytest.fixture
@@ -33,7 +37,7 @@ LISTING = "# color images\n# timestamp filename\n10.25 rgb/10.25.png\n10.50 rgb/
 
 
 def test_images_that_are_there_have_the_listings_times_and_the_others_are_counted(sequence):
-    made = open_tum_rgbd(sequence(LISTING))
+    made = opened(sequence(LISTING))
     assert tuple(made.names) == ("rgb/10.25.png", "rgb/10.75.png")
     assert [made.timestamp(name) for name in made.names] == [10.25, 10.75]
     assert made.notes[0].startswith("1 of the 3 images that ") and made.notes[0].endswith("rgb.txt lists are not there")
@@ -65,7 +69,7 @@ def test_camera_is_that_of_the_folders_name_or_else_of_the_recording(sequence, f
 
 @pytest.mark.parametrize("folder", ["desk", "fr4_desk", "freiburg12"])
 def test_camera_that_nothing_tells_is_asked_for(sequence, folder):
-    made = open_tum_rgbd(sequence(LISTING, folder))
+    made = opened(sequence(LISTING, folder))
     assert made.intrinsics is None
     assert "give source.intrinsics" in made.notes[-1]
 
@@ -84,7 +88,7 @@ def test_camera_that_nothing_tells_is_asked_for(sequence, folder):
 )
 def test_faulty_listing_is_named_by_file_and_line(sequence, listing, message):
     with pytest.raises(InputError, match=message) as caught:
-        open_tum_rgbd(sequence(listing))
+        opened(sequence(listing))
     assert "\n" not in str(caught.value)
 
 
@@ -92,7 +96,7 @@ def test_missing_or_binary_listing_is_named(sequence):
     folder = sequence(LISTING)
     (folder / "rgb.txt").write_bytes(b"\xff\x00\x81")
     with pytest.raises(InputError, match=r"rgb\.txt: cannot be read as text: .*; it should list the images"):
-        open_tum_rgbd(folder)
+        opened(folder)
     (folder / "rgb.txt").unlink()
     with pytest.raises(InputError, match=r"rgb\.txt: no such file; it should list the images"):
         open_source(SourceSettings(path=folder, kind="tum_rgbd"))

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from modp_ti.config.settings import SourceSettings
-from modp_ti.config.tracker_settings import SocketSettings
+from modp_ti.inputs.readers.socket import SocketSettings
 from modp_ti.inputs.tracker_server import open_tracker_server
 from tests.patience import PATIENCE
 

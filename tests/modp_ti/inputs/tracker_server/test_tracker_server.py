@@ -18,12 +18,12 @@ import pytest
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
 from modp_ti.config.settings import SourceSettings
-from modp_ti.config.tracker_settings import ColmapSettings, SocketSettings
 from modp_ti.files.errors import InputError
+from modp_ti.inputs.protocol import Tracker
+from modp_ti.inputs.readers.colmap import ColmapSettings
+from modp_ti.inputs.readers.socket import SocketSettings
 from modp_ti.inputs.tracker_server import open_tracker_server
 from modp_ti.inputs.tracker_server import tracker as tracker_server
-from modp_ti.inputs.trackers import Tracker
-from modp_ti.inputs.trackers.colmap import open_colmap
 from tests.modp_ti.inputs.tracker_server.clients import (
     CORRECTION,
     DONE,
@@ -46,6 +46,7 @@ from tests.modp_ti.inputs.tracker_server.clients import (
     point,
     pose,
 )
+from tests.opening import opened_with
 
 
 def test_frames_come_out_as_they_were_sent(tmp_path: Path) -> None:
@@ -83,7 +84,7 @@ def test_a_lens_and_a_scale_are_treated_as_the_colmap_reader_does(plane_scene, t
     model.cameras[1].model, model.cameras[1].params = lens.model, lens.params
     model.write_binary(str(folder))
     source = SourceSettings(path=plane_scene.folder, scale=0.5)
-    expected = list(open_colmap(source, ColmapSettings()))
+    expected = list(opened_with(source, ColmapSettings()))
     with opened(tmp_path / "s", scale=0.5, prefetch=8) as tracker, connect(tmp_path / "s") as connection:
         start = struct.pack("<IIII12d", 320, 240, 2, 1, *intrinsics, *k, *[0.0] * 4)
         connection.sendall(message(HELLO, start + b"a tracker"))

@@ -11,10 +11,10 @@ import pycolmap
 import pytest
 
 from modp_ti.config.settings import SourceSettings
-from modp_ti.config.tracker_settings import ColmapSettings
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.trackers import Tracker
-from modp_ti.inputs.trackers.colmap import open_colmap
+from modp_ti.inputs.protocol import Tracker
+from modp_ti.inputs.readers.colmap import ColmapSettings
+from tests.opening import opened_with
 
 
 def plane_points(count: int = 60) -> np.ndarray:
@@ -23,7 +23,7 @@ def plane_points(count: int = 60) -> np.ndarray:
 
 
 def opened(scene, model=None, **source):
-    return open_colmap(SourceSettings(path=scene.folder, **source), ColmapSettings(path=model))
+    return opened_with(SourceSettings(path=scene.folder, **source), ColmapSettings(path=model))
 
 
 def failure(scene, model=None, **source) -> str:
@@ -344,12 +344,12 @@ def test_of_two_cameras_the_folder_that_is_given_is_meant(plane_scene):
     points = [" ".join(line.split()[:8]) for line in _lines(folder, "points3D")]
     _write(folder, "points3D", points)
     left = plane_scene.folder.rename(plane_scene.folder.with_name("left"))
-    tracker = open_colmap(SourceSettings(path=left), ColmapSettings(path=folder))
+    tracker = opened_with(SourceSettings(path=left), ColmapSettings(path=folder))
     for frame, T in zip(tracker.frames, plane_scene.T_camera_world, strict=True):
         np.testing.assert_allclose(frame.T_camera_world, T, atol=1e-9)
     other = left.rename(left.with_name("middle"))
     with pytest.raises(InputError, match=r"are both the image view.*source\.path"):
-        open_colmap(SourceSettings(path=other), ColmapSettings(path=folder))
+        opened_with(SourceSettings(path=other), ColmapSettings(path=folder))
 
 
 def test_model_of_noise_is_refused_without_allocating_for_it(plane_scene):
@@ -384,7 +384,7 @@ def test_pose_that_is_none_is_named(plane_scene):
 def test_model_of_a_videos_frames_gives_the_frames_that_it_gives_for_images(plane_scene):
     points = plane_points()
     plane_scene.write_colmap(points)
-    expected = list(open_colmap(SourceSettings(path=plane_scene.folder), ColmapSettings()))
+    expected = list(opened_with(SourceSettings(path=plane_scene.folder), ColmapSettings()))
 
     video = plane_scene.folder.parent / "room.mkv"
     writer = cv2.VideoWriter(str(video), cv2.VideoWriter_fourcc(*"FFV1"), 30.0, plane_scene.size)
@@ -394,7 +394,7 @@ def test_model_of_a_videos_frames_gives_the_frames_that_it_gives_for_images(plan
     for first in (0, 1):  # programs that extract frames count from either
         renamed = replace(plane_scene, names=[f"room_{i + first:06d}.png" for i in range(len(plane_scene.names))])
         renamed.write_colmap(points)
-        tracker = open_colmap(SourceSettings(path=video), ColmapSettings())
+        tracker = opened_with(SourceSettings(path=video), ColmapSettings())
         assert len(tracker.notes) == first
         for frame, other in zip(tracker, expected, strict=True):
             assert np.array_equal(frame.image, other.image)

@@ -12,8 +12,8 @@ from fields.frames.origin import far_origin, shifted
 from fields.geometry.se3 import camera_centres
 from modp_ti.config.scene_file import load_scene
 from modp_ti.files.errors import InputError
+from modp_ti.inputs.opening import open_tracker
 from modp_ti.inputs.replay import ReplayedTracker
-from modp_ti.inputs.trackers import open_tracker
 from tests.fault_injection import samples, small_bag, small_recording, tracker_samples
 from tests.fault_injection.samples import CAPTURES, SAMPLES, write_sample
 from tests.fault_injection.small_recording import FRAMES, NAMES

@@ -18,11 +18,11 @@ from typer.testing import CliRunner
 from modp_ti.commands import app as cli
 from modp_ti.config.scene_file import load_scene
 from modp_ti.config.settings import SceneConfig
-from modp_ti.inputs.captures import KINDS
-from modp_ti.inputs.trackers import open_tracker
+from modp_ti.inputs.opening import open_tracker
 from tests.bags import recording as bag_messages
 from tests.bags import write_bag
 from tests.captures import WRITERS, View, zipped
+from tests.opening import CAPTURES
 
 PAGE = Path(__file__).resolve().parents[4] / "docs" / "trackers.md"
 SHARED = Path(__file__).resolve().parents[5] / "shared" / "data"
@@ -47,7 +47,7 @@ def test_every_block_is_a_valid_scene_of_its_section(kind, number, text, tmp_pat
 def test_every_reader_has_its_page():
     given = ["tum", "orbslam3", "stella_vslam", "aria", "modp", "replica", "sevenscenes", "matrices", "tanksandtemples"]
     sections = {name: texts for name, texts in blocks().items() if not name.startswith("Captures")}
-    assert list(sections) == [*given, *KINDS, "bag"]
+    assert set(sections) == {*given, *CAPTURES, "bag"}
     assert all(texts for texts in sections.values())
 
 
@@ -167,7 +167,7 @@ def test_tanksandtemples(recording):
     np.testing.assert_allclose([frame.T_camera_world for frame in frames], recording.T_camera_world[:2], atol=1e-9)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", CAPTURES)
 def test_captures(recording, kind):
     views = []
     for i in range(2):

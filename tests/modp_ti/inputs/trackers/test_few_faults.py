@@ -11,8 +11,8 @@ import pytest
 from fields.geometry.se3 import exp_se3
 from modp_ti.config.scene_file import load_scene
 from modp_ti.files.errors import InputError
+from modp_ti.inputs.opening import open_tracker
 from modp_ti.inputs.replay import ReplayedTracker
-from modp_ti.inputs.trackers import open_tracker
 from modp_ti.outputs.formats.trajectory import write_trajectory
 
 COUNT, FPS = 30, 10.0

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from modp_ti.inputs import given_poses
 from modp_ti.inputs.inspection.geometry import judge_geometry, measure_geometry
 from modp_ti.inputs.inspection.survey import survey
-from modp_ti.inputs.trackers import given_poses
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 

@@ -9,8 +9,8 @@ import pytest
 from modp_ti.config.keys import variants_of
 from modp_ti.config.settings import SceneConfig
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.captures import KINDS as CAPTURES
-from modp_ti.inputs.trackers import open_tracker
+from modp_ti.inputs.opening import open_tracker
+from tests.opening import CAPTURES
 
 KINDS = variants_of(SceneConfig.model_fields["tracker"])
 

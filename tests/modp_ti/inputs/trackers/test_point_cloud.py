@@ -7,8 +7,8 @@ import pytest
 
 from fields.geometry.camera import PinholeCamera
 from modp_ti.files.errors import InputError
+from modp_ti.inputs.point_cloud import read_ply_points, visible_points
 from modp_ti.inputs.sources import Undistorter
-from modp_ti.inputs.trackers.point_cloud import read_ply_points, visible_points
 
 XYZ = np.random.default_rng(0).normal(size=(20, 3)).astype(np.float32)
 

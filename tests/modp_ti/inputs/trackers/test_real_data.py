@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from modp_ti.config.settings import SourceSettings
-from modp_ti.config.tracker_settings import ColmapSettings, TransformsSettings
+from modp_ti.inputs.readers.colmap import ColmapSettings
+from modp_ti.inputs.readers.transforms import TransformsSettings
 from modp_ti.inputs.replay import PosedImage, ReplayedTracker
-from modp_ti.inputs.trackers.colmap import open_colmap
-from modp_ti.inputs.trackers.transforms import open_transforms
+from tests.opening import opened_with
 
 pytestmark = pytest.mark.real_data
 
@@ -40,7 +40,7 @@ def centres(tracker: ReplayedTracker) -> NDArray[np.float64]:
 )
 def test_colmap_points_project_onto_their_pixels(shared_data, name, frames, size, least_points):
     data = shared_data(name)
-    tracker = open_colmap(SourceSettings(path=data / "images", scale=0.25), ColmapSettings())
+    tracker = opened_with(SourceSettings(path=data / "images", scale=0.25), ColmapSettings())
     assert len(tracker) == frames
     for frame in tracker.frames:
         assert np.median(reprojection_errors(frame)) < 2.0
@@ -51,7 +51,7 @@ def test_colmap_points_project_onto_their_pixels(shared_data, name, frames, size
 
 
 def test_frames_of_redkitchen_without_pose_are_counted_and_keep_their_times(shared_data):
-    tracker = open_colmap(
+    tracker = opened_with(
         SourceSettings(path=shared_data("redkitchen") / "images", start=0, stop=50, scale=1.0),
         ColmapSettings(),
     )
@@ -66,7 +66,7 @@ def fox_transforms() -> ReplayedTracker:
     if not data.is_dir():
         pytest.skip("no ../shared/data/fox")
     source = SourceSettings(path=data / "images", scale=0.25, holdout=8)
-    return open_transforms(source, TransformsSettings())
+    return opened_with(source, TransformsSettings())
 
 
 def test_fox_lists_seventeen_frames_without_image(fox_transforms):
@@ -84,7 +84,7 @@ def test_fox_is_triangulated_densely_and_exactly(fox_transforms):
 
 def test_fox_poses_and_depths_of_both_files_agree(shared_data, fox_transforms):
     data = shared_data("fox")
-    colmap = open_colmap(SourceSettings(path=data / "images", scale=0.25), ColmapSettings())
+    colmap = opened_with(SourceSettings(path=data / "images", scale=0.25), ColmapSettings())
     assert [f.name for f in colmap.frames] == [f.name for f in fox_transforms.frames]
 
     # The worlds differ by a similarity: relative rotations do not depend on it.

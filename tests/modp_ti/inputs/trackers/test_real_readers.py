@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from modp_ti.config.settings import IntrinsicsSettings, SourceSettings
-from modp_ti.config.tracker_settings import AriaSettings, SevenScenesSettings, StellaVslamSettings, TumSettings
+from modp_ti.inputs.readers.aria import AriaSettings
+from modp_ti.inputs.readers.sevenscenes import SevenScenesSettings
+from modp_ti.inputs.readers.stella_vslam import StellaVslamSettings
+from modp_ti.inputs.readers.tum import TumSettings
 from modp_ti.inputs.replay import PosedImage, ReplayedTracker
-from modp_ti.inputs.trackers.aria import open_aria
-from modp_ti.inputs.trackers.data_sets import open_sevenscenes
-from modp_ti.inputs.trackers.stella_vslam import open_stella_vslam
-from modp_ti.inputs.trackers.tum import open_tum
+from tests.opening import opened_with
 
 
 def depth_image(file: Path, per_metre: float) -> NDArray[np.float64]:
@@ -58,7 +58,7 @@ def test_tum_poses_carry_one_frame_s_depth_into_the_last(shared_data, tmp_path):
     T[:3, :3], T[:3, 3] = Rotation.from_quat(row[4:]).as_matrix(), row[1:4]
     points = cloud_file(tmp_path / "points.txt", depth_image(depths[0], 5000), (517.3, 516.5, 319.1, 255.8), T)
     settings = TumSettings(points=points, max_points=3000)
-    tracker = open_tum(SourceSettings(path=data, scale=1.0), settings)
+    tracker = opened_with(SourceSettings(path=data, scale=1.0), settings)
     assert [frame.name for frame in tracker.frames] == [f"rgb/{name.name}" for name in names]
     assert any("images that" in note and "are not there" in note for note in tracker.notes)
     first, last = (depth_ratio(tracker.frames[i], depth_image(depths[i], 5000)) for i in (0, -1))
@@ -77,7 +77,7 @@ def test_sevenscenes_poses_carry_one_frame_s_depth_into_a_later(shared_data, tmp
     points = cloud_file(tmp_path / "points.txt", depths[0], K, T)
     camera = IntrinsicsSettings(fx=585.0)  # of the depth camera: it is what the poses are of
     source = SourceSettings(path=data, start=100, stop=141, step=40, scale=1.0, intrinsics=camera)
-    tracker = open_sevenscenes(source, SevenScenesSettings(points=points, max_points=3000))
+    tracker = opened_with(source, SevenScenesSettings(points=points, max_points=3000))
     assert any("those of the depth camera" in note for note in tracker.notes)
     ratio = depth_ratio(tracker.frames[1], depths[1])
     assert len(ratio) > 500
@@ -90,7 +90,7 @@ def stella() -> ReplayedTracker:
     if not data.is_dir():
         pytest.skip("no ../shared/data/redkitchen")
     source = SourceSettings(path=data, scale=0.5)
-    return open_stella_vslam(source, StellaVslamSettings(path=data / "stella"))
+    return opened_with(source, StellaVslamSettings(path=data / "stella"))
 
 
 def test_stella_s_trajectory_is_as_near_to_the_other_one_as_is_known_of_it(shared_data, stella):
@@ -130,7 +130,7 @@ def test_aria_s_files_are_read_and_the_missing_one_is_named(shared_data, tmp_pat
         cv2.imwrite(str(tmp_path / f"{i}.png"), np.full((80, 80, 3), 90, np.uint8))
     source = SourceSettings(path=tmp_path, intrinsics=IntrinsicsSettings(fx=40.0))
     settings = AriaSettings(path=folder, time_offset=-float(row[1]) * 1e-6)
-    tracker = open_aria(source, settings)
+    tracker = opened_with(source, settings)
 
     lines = map(json.loads, (folder / "online_calibration.jsonl").read_text().splitlines())
     nearest = min(lines, key=lambda line: abs(line["tracking_timestamp_us"] - int(row[1])))
@@ -151,5 +151,5 @@ def test_aria_s_files_are_read_and_the_missing_one_is_named(shared_data, tmp_pat
     assert any("semidense_observations.csv.gz is missing: it would have said" in note for note in tracker.notes)
     assert all(len(frame.points) >= 200 for frame in tracker.frames)
 
-    drifting = open_aria(source, settings.model_copy(update={"path": folder / "open_loop_trajectory.csv"}))
+    drifting = opened_with(source, settings.model_copy(update={"path": folder / "open_loop_trajectory.csv"}))
     assert any("odometry, which drifts" in note for note in drifting.notes)

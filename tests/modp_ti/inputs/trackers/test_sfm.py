@@ -9,13 +9,13 @@ import cv2
 import numpy as np
 import pytest
 
-import modp_ti.inputs.trackers.sfm as sfm
 from fields.geometry.se3 import camera_centres, exp_se3, inverse_se3
 from modp_ti.config.settings import IntrinsicsSettings, SourceSettings
-from modp_ti.config.tracker_settings import SfmSettings
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.trackers.sfm import open_sfm
+from modp_ti.inputs.readers import sfm
+from modp_ti.inputs.readers.sfm import SfmSettings
 from modp_ti.outputs.evaluation import umeyama
+from tests.opening import opened_with
 from tests.panoramas import equirectangular_rays, panorama, stroll
 from tests.room import Room, RoomRecording, pinhole, walk
 
@@ -34,7 +34,7 @@ def source(room: Room, tmp_path: Path) -> SourceSettings:
 
 def test_the_frames_have_the_poses_and_points_of_the_room(source: SourceSettings, room: Room, tmp_path: Path) -> None:
     said: list[str] = []
-    frames = list(open_sfm(source, SfmSettings(), tmp_path / "sfm", 0, lambda what, done, total: said.append(what)))
+    frames = list(opened_with(source, SfmSettings(), lambda what, done, total: said.append(what), tmp_path))
     assert [frame.name for frame in frames] == [f"view {i + 7}.png" for i in range(6)]
     assert list(dict.fromkeys(said)) == ["finding features", "matching images", "placing the images"]
     s, R, t = umeyama(camera_centres([frame.T_camera_world for frame in frames]), camera_centres(POSES))
@@ -57,7 +57,7 @@ def test_the_faces_of_panoramas_are_placed_as_a_rig(room: Room, tmp_path: Path) 
         cv2.imwrite(str(tmp_path / "images" / f"{i}.png"), image[..., ::-1])
     settings = {"path": tmp_path / "images", "panorama": {"projection": "equirectangular", "faces": 4}, "holdout": 3}
     source = SourceSettings.model_validate(settings)
-    opened = open_sfm(source, SfmSettings(), tmp_path / "sfm", 0)
+    opened = opened_with(source, SfmSettings(), output=tmp_path)
     frames, placed = list(opened), [T for i, T in enumerate(poses) if i != 2]
     assert [int(frame.name[0]) for frame in frames[::4]] == [0, 1, 3, 4, 5, 6]
     assert any("1 of 7 images have no pose" in note for note in opened.notes)
@@ -74,7 +74,7 @@ def test_the_faces_of_panoramas_are_placed_as_a_rig(room: Room, tmp_path: Path) 
             off = np.linalg.norm(frame.camera.project(p) - frame.points.pixels, axis=1)
             assert len(off) > 20 and np.median(off) < 0.7
     again = SourceSettings.model_validate({**settings, "panorama": {**settings["panorama"], "fov": 95}})
-    assert not any("used again" in note for note in open_sfm(again, SfmSettings(), tmp_path / "sfm", 0).notes)
+    assert not any("used again" in note for note in opened_with(again, SfmSettings(), output=tmp_path).notes)
 
 
 def test_the_model_is_kept_until_images_or_settings_change(
@@ -82,15 +82,15 @@ def test_the_model_is_kept_until_images_or_settings_change(
 ) -> None:
     made = []
     monkeypatch.setattr(sfm, "_reconstruct", lambda *arguments, _made=sfm._reconstruct: made.append(_made(*arguments)))
-    first = open_sfm(source, SfmSettings(), tmp_path / "sfm", 0)
-    again = open_sfm(source, SfmSettings(), tmp_path / "sfm", 0)
+    first = opened_with(source, SfmSettings(), output=tmp_path)
+    again = opened_with(source, SfmSettings(), output=tmp_path)
     assert len(made) == 1 and any("used again" in note for note in again.notes)
     np.testing.assert_array_equal(first.frames[3].T_camera_world, again.frames[3].T_camera_world)
-    open_sfm(source, SfmSettings(features=1500), tmp_path / "sfm", 0)
+    opened_with(source, SfmSettings(features=1500), output=tmp_path)
     assert len(made) == 2
     assert source.path is not None
     shutil.copyfile(source.path / "view 8.png", source.path / "view 9.png")
-    open_sfm(source, SfmSettings(features=1500), tmp_path / "sfm", 0)
+    opened_with(source, SfmSettings(features=1500), output=tmp_path)
     assert len(made) == 3
 
 
@@ -100,5 +100,5 @@ def test_pictures_without_a_scene_are_wrong_input(tmp_path: Path) -> None:
         noise = np.random.default_rng(i).integers(0, 256, (60, 80, 3), dtype=np.uint8)
         cv2.imwrite(str(tmp_path / "images" / f"{i}.png"), noise)
     with pytest.raises(InputError, match="could not join three of the 4 images"):
-        open_sfm(SourceSettings(path=tmp_path / "images", scale=1), SfmSettings(), tmp_path / "sfm", 0)
+        opened_with(SourceSettings(path=tmp_path / "images", scale=1), SfmSettings(), output=tmp_path)
     assert not (tmp_path / "sfm").exists()

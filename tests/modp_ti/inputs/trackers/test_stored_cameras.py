@@ -11,12 +11,12 @@ import pytest
 from PIL import Image
 
 from modp_ti.config.settings import SourceSettings
-from modp_ti.config.tracker_settings import ColmapSettings, TransformsSettings
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.protocol import Tracker
-from modp_ti.inputs.trackers.colmap import open_colmap
-from modp_ti.inputs.trackers.transforms import open_transforms
+from modp_ti.inputs.readers.colmap import ColmapSettings
+from modp_ti.inputs.readers.transforms import TransformsSettings
 from tests.modp_ti.conftest import PlaneScene
+from tests.opening import opened_with
 
 COUNTERCLOCKWISE = {3: 2, 6: 1, 8: 3}  # quarter turns from the upright to the stored image, by orientation
 POINTS = np.c_[np.random.default_rng(2).uniform(-1.8, 1.8, (60, 2)), np.zeros(60)]
@@ -56,11 +56,11 @@ def assert_upright(tracker: Tracker, scene: PlaneScene) -> None:
 
 
 def colmap(scene: PlaneScene) -> Tracker:
-    return open_colmap(SourceSettings(path=scene.folder), ColmapSettings())
+    return opened_with(SourceSettings(path=scene.folder), ColmapSettings())
 
 
 def transforms(scene: PlaneScene) -> Tracker:
-    return open_transforms(SourceSettings(path=scene.folder), TransformsSettings())
+    return opened_with(SourceSettings(path=scene.folder), TransformsSettings())
 
 
 def write_cloud(scene: PlaneScene) -> None:

@@ -12,17 +12,17 @@ import pytest
 
 from fields.geometry.se3 import exp_se3
 from modp_ti.config.settings import SourceSettings
-from modp_ti.config.tracker_settings import TransformsSettings
 from modp_ti.files.errors import InputError
+from modp_ti.inputs.protocol import Tracker
+from modp_ti.inputs.readers.transforms import TransformsSettings
 from modp_ti.inputs.sources.distortion import COEFFICIENTS, colmap_lens
-from modp_ti.inputs.trackers import Tracker
-from modp_ti.inputs.trackers.transforms import open_transforms
+from tests.opening import opened_with
 
 pytestmark = pytest.mark.slow
 
 
 def opened(scene, file=None, progress=None, **source):
-    return open_transforms(SourceSettings(path=scene.folder, **source), TransformsSettings(path=file), progress)
+    return opened_with(SourceSettings(path=scene.folder, **source), TransformsSettings(path=file), progress)
 
 
 def failure(scene, file=None, **source) -> str:
@@ -287,7 +287,7 @@ def test_paths_of_windows_are_read(with_cloud):
     for frame in data["frames"]:
         frame["file_path"] = ".\\" + frame["file_path"].replace("/", "\\")
     file.write_text(json.dumps(data))
-    tracker = open_transforms(SourceSettings(path=with_cloud.folder), TransformsSettings())
+    tracker = opened_with(SourceSettings(path=with_cloud.folder), TransformsSettings())
     assert [frame.name for frame in tracker.frames] == with_cloud.names
     assert all(len(frame.points) for frame in tracker.frames)
 
@@ -305,9 +305,9 @@ def with_another_camera(scene, width: int, height: int) -> None:
 
 
 def test_images_of_several_sizes_are_delivered_at_that_of_the_first(with_cloud):
-    whole = list(open_transforms(SourceSettings(path=with_cloud.folder), TransformsSettings()))
+    whole = list(opened_with(SourceSettings(path=with_cloud.folder), TransformsSettings()))
     with_another_camera(with_cloud, 160, 120)
-    tracker = open_transforms(SourceSettings(path=with_cloud.folder), TransformsSettings())
+    tracker = opened_with(SourceSettings(path=with_cloud.folder), TransformsSettings())
     assert "the images have 2 sizes: they are mapped at 320x240" in tracker.notes
     for frame, before in zip(tracker, whole, strict=True):
         assert frame.image.shape == before.image.shape
@@ -317,9 +317,9 @@ def test_images_of_several_sizes_are_delivered_at_that_of_the_first(with_cloud):
 
 
 def test_an_image_of_another_shape_keeps_it_and_gets_the_longer_side_of_the_first(with_cloud):
-    whole = list(open_transforms(SourceSettings(path=with_cloud.folder), TransformsSettings()))
+    whole = list(opened_with(SourceSettings(path=with_cloud.folder), TransformsSettings()))
     with_another_camera(with_cloud, 160, 160)
-    tracker = open_transforms(SourceSettings(path=with_cloud.folder), TransformsSettings())
+    tracker = opened_with(SourceSettings(path=with_cloud.folder), TransformsSettings())
     assert "the images have 2 sizes: they are mapped at 320x240, 320x320" in tracker.notes
     assert tracker.largest == (320, 320)
     frames = list(tracker)
@@ -340,7 +340,7 @@ def test_the_faces_of_a_panorama_lie_at_its_pose(tmp_path):
     source = SourceSettings.model_validate(
         {"path": tmp_path / "images", "holdout": 2, "start": 1, "panorama": panorama}
     )
-    tracker = open_transforms(source, TransformsSettings())
+    tracker = opened_with(source, TransformsSettings())
     assert [frame.name for frame in tracker.frames] == [f"{i}-face{n}.png" for i in (1, 2, 3) for n in range(3)]
     for place, frame in enumerate(tracker):
         T = poses[1 + place // 3]

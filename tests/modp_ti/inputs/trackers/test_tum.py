@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.trackers import Tracker
-from modp_ti.inputs.trackers.point_cloud import read_point_file
+from modp_ti.inputs.point_cloud import read_point_file
+from modp_ti.inputs.protocol import Tracker
 
 
 @pytest.fixture

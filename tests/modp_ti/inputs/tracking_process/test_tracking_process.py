@@ -20,10 +20,9 @@ from fields.frames.tracked_frame import TrackedFrame
 from modp_ti.config.settings import SceneConfig, SourceSettings
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.klt import open_klt
-from modp_ti.inputs.opening import open_source
+from modp_ti.inputs.opening import open_source, open_tracker
 from modp_ti.inputs.sources import FrameReader
 from modp_ti.inputs.sources.frame_store import list_frames
-from modp_ti.inputs.trackers import open_tracker
 from modp_ti.inputs.tracking_process import TrackingProcess
 from tests.modp_ti.inputs.mjpeg_camera import MjpegCamera, encoded
 from tests.modp_ti.inputs.tracking_process.frames import assert_same

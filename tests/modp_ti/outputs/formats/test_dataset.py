@@ -13,9 +13,9 @@ import pytest
 from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from modp_ti.config.settings import SourceSettings
-from modp_ti.config.tracker_settings import ColmapSettings
+from modp_ti.inputs.readers.colmap import ColmapSettings
 from modp_ti.inputs.tracked_points import TrackedPoints
-from modp_ti.inputs.trackers.colmap import open_colmap
+from tests.opening import opened_with
 from modp_ti.outputs.formats.dataset import image_names, write_colmap, write_image
 
 CAMERAS = [PinholeCamera(50.0, 51.0, 20.5, 14.0, 40, 30), PinholeCamera(55.0, 55.0, 20.0, 15.0, 40, 30)]
@@ -116,7 +116,7 @@ def test_our_own_reader_gives_the_same_frames_back(tracked: TrackedPoints, tmp_p
     for name, frame in zip(names, frames(), strict=True):
         write_image(folder, name, frame)
     source = SourceSettings(path=folder / "images", masks=None)
-    again = list(open_colmap(source, ColmapSettings(path=folder)))
+    again = list(opened_with(source, ColmapSettings(path=folder)))
     assert [f.name for f in again] == ["left/frame2.png", "left/frame10.png", "right/a.png"]
     for ours, theirs in zip(again, frames(), strict=True):
         assert ours.camera == theirs.camera

@@ -12,7 +12,7 @@ import pytest
 
 from modp_ti.config.scene_file import load_scene
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.trackers import open_tracker
+from modp_ti.inputs.opening import open_tracker
 from modp_ti.outputs.formats.dataset import write_image
 from modp_ti.outputs.playback.finished_frames import FinishedFrames, frames_of
 from modp_ti.outputs.playback.finished_run import open_run

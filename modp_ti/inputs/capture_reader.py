@@ -1,0 +1,233 @@
+"""Base classes of the readers of captures: recordings of phones, robots and data sets that bring cameras and poses."""
+
+from __future__ import annotations
+
+import io
+from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from modp_ti.files.errors import FEW, InputError
+from modp_ti.files.file_tree import FileTree, open_tree
+from modp_ti.inputs.capture import Capture, CapturedFrame
+from modp_ti.inputs.depth_maps import depth_points
+from modp_ti.inputs.given_poses import checked_reader, missing_frames_note, selected_frames, solving
+from modp_ti.inputs.multiview.triangulation import adjusted_frames, triangulated_frames
+from modp_ti.inputs.opening import open_source
+from modp_ti.inputs.protocol import Progress
+from modp_ti.inputs.reader import TrackerSettings
+from modp_ti.inputs.replay import PosedImage, ReplayedTracker
+from modp_ti.inputs.sources.intrinsics import Intrinsics
+from modp_ti.inputs.sources.listed_images import ListedImages
+from modp_ti.inputs.sources.orientation import Turn
+from modp_ti.inputs.sources.protocol import ImageSource
+from modp_ti.inputs.sources.undistortion import both_valid
+from modp_ti.inputs.sources.video_file import VideoFile
+from modp_ti.inputs.stored_cameras import StoredView, stored_frames
+
+if TYPE_CHECKING:
+    from modp_ti.config.settings import SceneConfig, SourceSettings
+
+__all__ = ["CaptureSettings", "DepthCaptureSettings"]
+
+
+class CaptureSettings(TrackerSettings):
+    """Base class for captures, whose cameras and poses come with the images of `source.path`.
+
+    A kind defines `source_kind`, `holds`, `recognises` and `read`.
+    """
+
+    brings_cameras: ClassVar[bool] = True
+    holds: ClassVar[str]
+    """What such a capture holds, for error messages."""
+
+    adjust: bool = Field(
+        default=False,
+        description="bundle adjust the poses with triangulated points before the first frame: for poses with errors of "
+        "more than a pixel",
+    )
+
+    @classmethod
+    @abstractmethod
+    def read(cls, tree: FileTree) -> Capture:
+        """Read the cameras, poses and names of the frames of a recording that `recognises` knows.
+
+        Raises:
+            InputError: If it is malformed.
+        """
+
+    @classmethod
+    def poses_of(cls, path: Path) -> tuple[dict[str, Any], Path] | None:
+        return {}, path
+
+    @classmethod
+    def open_images(cls, path: Path, source: SourceSettings) -> ImageSource:
+        """Open the images of a capture. Their camera is that of the first, for trackers that track them themselves."""
+        capture = _capture(cls, path)
+        if not capture.frames:
+            raise InputError(f"{path}: has no frame that could be used")
+        first = capture.frames[0]
+        if not capture.video:
+            images: ImageSource = _CapturedImages(capture)
+            images.intrinsics = Intrinsics(first.camera, first.lens)
+            return images
+        images = VideoFile(capture.tree.path / capture.video, source.fps, source.stop)
+        count, posed = len(images.names), len(capture.frames)
+        size = images.frame_size
+        frames = [
+            replace(frame, image=name, camera=frame.camera.resized(*size))
+            for frame, name in zip(capture.frames, images.names, strict=False)
+        ]
+        for note in capture.notes:
+            images.add_note(note)
+        if count < posed and source.stop is None:
+            images.add_note(
+                f"{capture.video} has {count} frames, {capture.origin} {posed} rows: the last rows are left out"
+            )
+        images.capture = replace(capture, frames=frames)
+        images.intrinsics = Intrinsics(frames[0].camera, first.lens)
+        return images
+
+    def open(self, scene: SceneConfig, progress: Progress | None = None) -> ReplayedTracker:
+        """Open the images of a capture that have a pose, each with its own camera.
+
+        Points are triangulated before the first frame is delivered.
+        """
+        source = scene.source
+        if source.kind not in ("auto", self.source_kind):
+            raise InputError(
+                f"{source.path}: source.kind: {source.kind} has no poses of tracker.kind: {self.kind}: leave "
+                "source.kind out"
+            )
+        source = source.model_copy(update={"kind": self.source_kind})
+        images = open_source(source)
+        capture = images.capture
+        assert capture is not None
+        origin = str(capture.tree.path / capture.origin)
+        selected = selected_frames(images, source)
+        found = {frame.image: frame for frame in capture.frames}
+        views = {
+            name: StoredView(frame.camera, frame.lens, frame.T_camera_world)
+            for name in selected
+            if (frame := found.get(name)) is not None and frame.T_camera_world is not None
+        }
+        if not views:
+            raise InputError(
+                f"{origin}: has no pose for any of the {len(selected)} frames that are selected, or is missing: "
+                "tracker.kind=klt tracks the images alone"
+            )
+        frames, turns, notes = stored_frames(images, views, origin)
+        notes = [*missing_frames_note(selected, views, capture.origin), *notes]
+        reader = checked_reader(images, source, {frame.name: frame.undistorter for frame in frames}, origin)
+        if self.adjust:
+            frames, note = adjusted_frames(images, frames, solving(frames, source), progress)
+            return ReplayedTracker(reader, frames, [*notes, note])
+        frames, more = self._with_depths(capture, [found[name] for name in views], turns, frames, progress)
+        if not any(len(frame.points) for frame in frames):
+            frames = triangulated_frames(images, frames, solving(frames, source), progress)
+        return ReplayedTracker(reader, frames, [*notes, *more])
+
+    def _with_depths(
+        self,
+        capture: Capture,
+        captured: Sequence[CapturedFrame],
+        turns: Sequence[Turn],
+        frames: list[PosedImage],
+        progress: Progress | None,
+    ) -> tuple[list[PosedImage], list[str]]:
+        """Return the frames with points of their depth maps, where there are some, and remarks for the user."""
+        return frames, []
+
+
+class DepthCaptureSettings(CaptureSettings):
+    """Base class for captures with depth maps, whose confident depths are the tracked points."""
+
+    depth: bool = Field(
+        default=True,
+        description="take the tracked points from the depth maps, where there are some; false, and with `adjust`: "
+        "triangulate them",
+    )
+    max_points: int = Field(default=400, ge=10, description="largest number of points of a frame from its depth map")
+    max_depth: float = Field(default=5.0, gt=0, description="largest depth [m] that is used")
+
+    def _with_depths(
+        self,
+        capture: Capture,
+        captured: Sequence[CapturedFrame],
+        turns: Sequence[Turn],
+        frames: list[PosedImage],
+        progress: Progress | None,
+    ) -> tuple[list[PosedImage], list[str]]:
+        """Damaged maps are left out, up to a share `FEW` of them."""
+        if not self.depth or capture.read_depth is None:
+            return frames, []
+        result, damaged = list(frames), []
+        for index, (stored, turn, frame) in enumerate(zip(captured, turns, frames, strict=True)):
+            if stored.depth is None:
+                continue
+            try:
+                depth = capture.read_depth(capture.tree, stored)
+            except OSError as error:
+                damaged.append(f"{capture.tree.path / stored.depth}: unreadable depth map: {error.strerror}")
+                continue
+            points = depth_points(depth, stored, turn, frame, index, self.max_points, self.max_depth)
+            result[index] = frame.with_points(points)
+            if progress is not None:
+                progress("reading depths", index + 1, len(frames))
+        if len(damaged) > FEW * len(frames):
+            raise InputError(f"{damaged[0]}; copy the capture again, or set tracker.depth: false")
+        lost = f"{len(damaged)} depth maps are damaged: left out (the first: {damaged[0]})" if damaged else ""
+        return result, [lost] if lost else []
+
+
+def _capture(reader: type[CaptureSettings], path: Path) -> Capture:
+    """Read a capture of a kind. The archive stays open for its images."""
+    if not path.exists():
+        raise InputError(f"{path}: no such capture (source.path)")
+    trees = open_tree(path)
+    tree = next((tree for tree in trees if reader.recognises(tree)), None)
+    try:
+        if tree is None:
+            raise InputError(
+                f"{path}: is no capture of kind {reader.source_kind}, which holds {reader.holds} (source.path)"
+            )
+        return reader.read(tree)
+    except InputError:
+        trees[0].close()
+        raise
+
+
+class _CapturedImages(ListedImages):
+    """The images of a capture in files, in a folder or an archive."""
+
+    def __init__(self, capture: Capture) -> None:
+        frames = capture.frames
+        super().__init__(
+            capture.tree.path, [frame.image for frame in frames], [frame.time for frame in frames], notes=capture.notes
+        )
+        self.capture = self._capture = capture
+
+    def _open(self, name: str) -> BinaryIO:
+        return io.BytesIO(self._content(name))
+
+    def _content(self, name: str) -> bytes:
+        return self._capture.tree.read(name)
+
+    def valid(self, name: str) -> NDArray[np.bool_] | None:
+        border = self._capture.border
+        seen = super().valid(name)
+        if not border:
+            return seen
+        width, height = self.size(name)
+        mask = np.zeros((height, width), dtype=bool)
+        mask[border:-border, border:-border] = True
+        return both_valid(mask, seen)
+
+    def close(self) -> None:
+        self._capture.tree.close()

@@ -1,0 +1,53 @@
+"""Kind `klt`: the built-in tracker, in `modp_ti.inputs.klt`."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+
+from pydantic import Field
+
+from modp_ti.inputs.protocol import Progress, Tracker
+from modp_ti.inputs.reader import TrackerSettings
+
+if TYPE_CHECKING:
+    from modp_ti.config.settings import SceneConfig
+
+__all__ = ["KltSettings"]
+
+
+class KltSettings(TrackerSettings):
+    """The built-in tracker, which needs only the images."""
+
+    follows_streams: ClassVar[bool] = True
+
+    kind: Literal["klt"] = Field(default="klt", description="the built-in tracker, which uses only the images")
+    loops: bool = Field(
+        default=False,
+        description="close loops, drift of scale included, where the camera comes back after a long way. Needs "
+        "`pip install 'modp-ti[loops]'`, and a second core",
+    )
+    maps: Literal["first", "largest", "all"] | Annotated[int, Field(ge=1)] = Field(
+        default="first",
+        description="which map is mapped, where the track is lost and what follows shows no place of what was before. "
+        "`first`: the first one of 8 keyframes or 60 frames, while the images arrive; `largest`: that with the most "
+        "frames, so that all images are tracked before the first is mapped; `all`: the largest, and then each other of "
+        "8 keyframes or 60 frames in a run of its own, to `map-2`, `map-3`, ... in the output folder; a number: the "
+        "map of this place by size",
+    )
+
+    @property
+    def place(self) -> int | None:
+        """Place by size of the map that is mapped; None for the first one."""
+        if isinstance(self.maps, int):
+            return self.maps
+        return None if self.maps == "first" else 1
+
+    def open(self, scene: SceneConfig, progress: Progress | None = None) -> Tracker:
+        """Open the tracker, in a process of its own where it keeps pace with its images."""
+        if scene.tracks_beside_mapping:
+            from modp_ti.inputs.tracking_process import TrackingProcess
+
+            return TrackingProcess(scene, progress)
+        from modp_ti.inputs.klt import open_klt
+
+        return open_klt(scene.source, self, scene.seed, progress)

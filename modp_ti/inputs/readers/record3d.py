@@ -1,0 +1,231 @@
+"""Captures of Record3D: the archive `.r3d`, unpacked or not, and the export of EXR and RGB files."""
+
+from __future__ import annotations
+
+import struct
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from modp_ti.files.errors import InputError
+from modp_ti.files.file_tree import FileTree
+from modp_ti.files.trajectory import poses_of_quaternions
+from modp_ti.inputs.capture import (
+    Capture,
+    CapturedFrame,
+    DepthMap,
+    checked_numbers,
+    checked_time,
+    depth_files,
+    opengl_pose,
+    picture_size,
+    plausible_camera,
+)
+from modp_ti.inputs.capture_reader import DepthCaptureSettings
+
+__all__ = ["Record3dSettings"]
+
+METADATA = ("metadata", "metadata.json")
+FOLDERS = ("rgbd", "rgb")
+SUFFIXES = (".jpg", ".jpeg", ".png")
+# Sizes (width, height) of depth maps by their number of pixels, for older archives that do not state them: LiDAR and
+# the front camera. The pictures are upright.
+DEPTH_SIZES = {192 * 256: (192, 256), 480 * 640: (480, 640)}
+# Names and types of two attributes of EXR files, and the largest side that a depth map may have [px].
+CHANNELS, WINDOW, MOST_EXR = b"channels\0chlist\0", b"dataWindow\0box2i\0", 1 << 12
+CONFIDENT = 2  # of 0, 1 and 2
+INSTALL = "its depths need lzfse: pip install 'modp-ti[record3d]'"
+
+
+class Record3dSettings(DepthCaptureSettings):
+    """A capture of Record3D."""
+
+    source_kind: ClassVar[str] = "record3d"
+    holds: ClassVar[str] = "metadata and rgbd/0.jpg, ..."
+
+    kind: Literal["record3d"] = Field(
+        default="record3d", description="a capture of Record3D, `.r3d` or its export of EXR and RGB files"
+    )
+
+    @classmethod
+    def recognises(cls, tree: FileTree) -> bool:
+        return any(tree.has(name) for name in METADATA) and any(_pictures(tree).values())
+
+    @classmethod
+    def read(cls, tree: FileTree) -> Capture:
+        """Read the frames of a capture. Frame N is `rgbd/N.jpg`, with row N of the metadata.
+
+        Raises:
+            InputError: If the metadata are missing or malformed.
+        """
+        origin = next((name for name in METADATA if tree.has(name)), METADATA[0])
+        where = str(tree.path / origin)
+        data = tree.read_json(origin)
+        poses = data.get("poses") if isinstance(data, dict) else None
+        if not isinstance(poses, list) or not poses:
+            raise InputError(f"{where}: holds no list of `poses`; it is no metadata of Record3D")
+        rows = np.array([checked_numbers(row, 7, f"{where}: pose {n}") for n, row in enumerate(poses)])
+        T_world_camera = poses_of_quaternions(rows[:, 4:], rows[:, :4], lambda n: f"{where}: pose {n}")
+        coefficients = _coefficients(data, len(poses), where)
+        times = _times(data, len(poses), where)
+        pictures = {n: name for n, name in sorted(_pictures(tree).items()) if n < len(poses)}
+        if not pictures:
+            raise InputError(f"{tree.path}: holds no picture {FOLDERS[0]}/0.jpg, ... of its {len(poses)} poses")
+        size = _size(tree, next(iter(pictures.values())), data, where)
+        frames = []
+        for n, name in pictures.items():
+            stem = name.rpartition(".")[0]
+            depth, confidence = depth_files(tree, f"{stem}.depth", f"{stem}.conf")
+            if depth is None:
+                depth, confidence = depth_files(tree, f"depth/{n}.exr", f"confidence/{n}.png")
+            camera = plausible_camera(*coefficients[n], size, f"{where}: intrinsics of frame {n}")
+            T = opengl_pose(T_world_camera[n], f"{where}: pose {n}")
+            frames.append(CapturedFrame(name, times[n], camera, T, depth=depth, confidence=confidence))
+        notes = [f"{tree.path}: is a capture of Record3D"]
+        depth_size = tuple(data.get(key) for key in ("dw", "dh"))
+        packed = any(frame.depth is not None and frame.depth.endswith(".depth") for frame in frames)
+        if packed and not _can_unpack():
+            frames = [CapturedFrame(f.image, f.time, f.camera, f.T_camera_world) for f in frames]
+            notes.append(f"{tree.path}: {INSTALL}: points are triangulated instead")
+        return Capture(tree, origin, frames, notes, read_depth=lambda tree, frame: _read_depth(tree, frame, depth_size))
+
+
+def _pictures(tree: FileTree) -> dict[int, str]:
+    """Names of the pictures by number."""
+    for folder in FOLDERS:
+        found = {}
+        for name in tree.listed(folder):
+            stem, dot, suffix = name[len(folder) + 1 :].rpartition(".")
+            if stem.isascii() and stem.isdecimal() and len(stem) < 9 and (dot + suffix).lower() in SUFFIXES:
+                found.setdefault(int(stem), name)
+        if found:
+            return found
+    return {}
+
+
+def _coefficients(data: dict[str, Any], count: int, where: str) -> list[tuple[float, float, float, float]]:
+    """Return (fx, fy, cx, cy) [px] of each frame."""
+    each = data.get("perFrameIntrinsicCoeffs")
+    if isinstance(each, list) and len(each) >= count:
+        rows = [checked_numbers(row, 4, f"{where}: perFrameIntrinsicCoeffs {n}") for n, row in enumerate(each[:count])]
+    else:
+        K = checked_numbers(data.get("K"), 9, f"{where}: `K`")  # column by column
+        rows = [[K[0], K[4], K[6], K[7]]] * count
+    return [(fx, fy, cx, cy) for fx, fy, cx, cy in rows]
+
+
+def _times(data: dict[str, Any], count: int, where: str) -> list[float]:
+    each = data.get("frameTimestamps")
+    if isinstance(each, list) and len(each) >= count:
+        return [checked_time(time, f"{where}: frameTimestamps {n}") for n, time in enumerate(each[:count])]
+    (fps,) = checked_numbers(data.get("fps", 60), 1, f"{where}: `fps`")
+    if not 1e-3 <= fps <= 1e6:
+        raise InputError(f"{where}: `fps` is {fps:g}; the file is damaged")
+    return [n / fps for n in range(count)]
+
+
+def _size(tree: FileTree, picture: str, data: dict[str, Any], where: str) -> tuple[float, float]:
+    """Return the size (width, height) of the pictures. In some captures `w` and `h` are exchanged."""
+    width, height = (checked_numbers(data.get(key), 1, f"{where}: `{key}`")[0] for key in ("w", "h"))
+    return (height, width) if picture_size(tree, picture) == (height, width) else (width, height)
+
+
+def _can_unpack() -> bool:
+    try:
+        import lzfse  # noqa: F401  # pyright: ignore[reportMissingImports]
+    except ImportError:
+        return False
+    return True
+
+
+def _read_depth(tree: FileTree, frame: CapturedFrame, size: tuple[Any, ...]) -> DepthMap:
+    assert frame.depth is not None
+    if frame.depth.endswith(".exr"):
+        metres = _read_exr(tree.read(frame.depth))
+        return DepthMap(metres, np.isfinite(metres))
+    data = tree.read(frame.depth)
+    width, height = (
+        size if all(isinstance(side, int) for side in size) else DEPTH_SIZES.get(_claimed(data) // 4, (0, 0))
+    )
+    if not (0 < width <= 1 << 12 and 0 < height <= 1 << 12):
+        raise OSError(0, "its size is not known")
+    metres = np.frombuffer(_unpacked(data, 4 * width * height), "<f4").reshape(height, width)
+    confident = np.isfinite(metres)
+    if frame.confidence is not None:
+        levels = np.frombuffer(_unpacked(tree.read(frame.confidence), width * height), np.uint8)
+        confident &= levels.reshape(height, width) >= CONFIDENT
+    return DepthMap(metres, confident)
+
+
+def _read_exr(data: bytes) -> NDArray[np.float32]:
+    """Read the depths (H, W) of an EXR file, which has one channel, or three alike. Rows that are cut off become 0."""
+    import av
+    from av.error import FFmpegError
+
+    size = _exr_size(data)
+    if size is None or max(size) > MOST_EXR:
+        raise OSError(0, "it is damaged, or no EXR")
+    # FFmpeg reads one channel if it is called Y.
+    at = data.index(CHANNELS) + len(CHANNELS) + 4
+    if data[at + 1 : at + 2] == b"\0" == data[at + 18 : at + 19]:
+        data = data[:at] + b"Y" + data[at + 1 :]
+    try:
+        decoder = av.CodecContext.create("exr", "r")
+        assert isinstance(decoder, av.VideoCodecContext)
+        (frame,) = decoder.decode(av.Packet(data))
+        metres = frame.to_ndarray()
+    except (FFmpegError, ValueError):
+        raise OSError(0, "it is damaged, or an EXR that FFmpeg cannot read") from None
+    return np.asarray(metres if metres.ndim == 2 else metres[..., 0], np.float32)
+
+
+def _exr_size(data: bytes) -> tuple[int, int] | None:
+    """Return the size (width, height) that the header of an EXR file states; None if there is none."""
+    at = data.find(WINDOW)
+    if not data.startswith(b"\x76\x2f\x31\x01") or at < 0 or CHANNELS not in data or len(data) < at + 64:
+        return None
+    left, top, right, bottom = struct.unpack_from("<4i", data, at + len(WINDOW) + 4)
+    return right - left + 1, bottom - top + 1
+
+
+def _unpacked(data: bytes, size: int) -> bytes:
+    """Unpack LZFSE data of `size` bytes. Raises OSError if they unpack to another size."""
+    import lzfse  # pyright: ignore[reportMissingImports]  # an extra
+
+    if _claimed(data) != size:
+        raise OSError(0, f"it unpacks to {_claimed(data)} bytes instead of {size}")
+    try:
+        unpacked = lzfse.decompress(data)
+    except (lzfse.error, MemoryError):  # both for damaged data
+        raise OSError(0, "it is damaged") from None
+    if len(unpacked) != size:
+        raise OSError(0, "it is damaged")
+    return unpacked
+
+
+def _claimed(data: bytes) -> int:
+    """Return the size that LZFSE data claim to unpack to, by the headers of their blocks; -1 if they are damaged.
+
+    It is read before anything is unpacked, so that damaged data take no memory.
+    """
+    at = total = 0
+    try:
+        while (magic := data[at : at + 4]) != b"bvx$":
+            (size,) = struct.unpack_from("<I", data, at + 4)
+            total += size
+            if magic == b"bvx-":  # not packed
+                at += 8 + size
+            elif magic == b"bvxn":
+                at += 12 + struct.unpack_from("<I", data, at + 8)[0]
+            elif magic == b"bvx2":  # packed fields: 20 bits from 20 on, 20 bits from 40 on, 32 bits
+                literals, lmd, header = struct.unpack_from("<QQQ", data, at + 8)
+                at += (header & 0xFFFFFFFF) + (literals >> 20 & 0xFFFFF) + (lmd >> 40 & 0xFFFFF)
+                if not header & 0xFFFFFFFF:
+                    return -1
+            else:
+                return -1
+    except struct.error:
+        return -1
+    return total

@@ -1,0 +1,297 @@
+"""Trajectories of timed poses, and the images that they belong to by time. Ground truth is one of them."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from modp_ti.files.errors import FEW, InputError
+from modp_ti.files.trajectory import read_tum_rows, tum_poses
+from modp_ti.inputs.given_poses import missing_frames_note, replay_poses, selected_frames
+from modp_ti.inputs.opening import open_source
+from modp_ti.inputs.protocol import Before, Progress
+from modp_ti.inputs.reader import TimedPosesSettings, TrajectorySettings
+from modp_ti.inputs.replay import ReplayedTracker
+from modp_ti.inputs.sources import ImageSource
+
+if TYPE_CHECKING:
+    from modp_ti.config.settings import SourceSettings
+
+__all__ = [
+    "MAX_DIFFERENCE",
+    "TimedPoses",
+    "associate",
+    "open_ground_truth",
+    "read_trajectory_file",
+    "replay_trajectory",
+    "require_rising",
+    "rows_at_frames",
+    "true_poses",
+]
+
+# Units of times that are not seconds. Nanoseconds may have been taken for such from NANOSECONDS_FROM on.
+UNITS = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9, "microseconds since 1970": 1e3}
+
+# Times from here on are nanoseconds: in seconds they would be 3 million years.
+NANOSECONDS_FROM = 1e14
+
+MAX_DIFFERENCE = 0.02
+"""Largest time difference of a pair [s], as in the TUM benchmark."""
+
+# Above MANY_PAIRS candidate pairs, only the NEAREST candidates on each side of a time are compared, to bound memory.
+MANY_PAIRS = 4_000_000
+NEAREST = 64
+
+# A similarity has 7 parameters. Three camera centres that are not on a line determine it.
+LEAST_FRAMES = 3
+
+
+@dataclass(frozen=True)
+class TimedPoses:
+    """Poses over time.
+
+    Attributes:
+        path: The file, for error messages.
+        times: Times (N,) [s], strictly increasing.
+        T_camera_world: Poses (N, 4, 4), world to camera.
+        left_out: Number of skipped lines.
+    """
+
+    path: Path
+    times: NDArray[np.float64]
+    T_camera_world: NDArray[np.float64]
+    left_out: int = 0
+
+
+def read_trajectory_file(path: Path) -> TimedPoses:
+    """Read a trajectory in TUM format: `time tx ty tz qx qy qz qw` per line, camera to world, ordered by time.
+
+    Times are in seconds, or in nanoseconds in ORB-SLAM3's EuRoC variant; the magnitude decides. Lines with NaN, which
+    trackers write when they are lost, and lines with times out of order are skipped, up to a share `FEW` each.
+
+    Raises:
+        InputError: If a line has the wrong number of columns or a quaternion that is not of unit length, or if too many
+            lines are faulty. The message names file and line.
+    """
+    rows = read_tum_rows(path, few=FEW)
+    rising, left_out = _rising(rows.values[:, 0]), rows.left_out
+    if len(rows) - len(rising) <= FEW * len(rows):
+        left_out += len(rows) - len(rising)
+        rows = replace(rows, values=rows.values[rising], lines=rows.lines[rising])
+    T_camera_world = tum_poses(rows)
+    require_rising(rows.values[:, 0], rows.where)
+    times = rows.values[:, 0] * (1e-9 if rows.values[-1, 0] >= NANOSECONDS_FROM else 1.0)
+    return TimedPoses(path, times, T_camera_world, left_out)
+
+
+def _rising(times: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return the indices of the longest strictly increasing subsequence of the times."""
+    ends: list[float] = []  # smallest last value of an increasing subsequence of each length; `places` is its index
+    places: list[int] = []
+    before = np.full(len(times), -1)
+    for i, time in enumerate(times.tolist()):
+        length = bisect_left(ends, time)
+        before[i] = places[length - 1] if length else -1
+        ends[length : length + 1] = [time]
+        places[length : length + 1] = [i]
+    chain, i = [], places[-1]
+    while i >= 0:
+        chain.append(i)
+        i = int(before[i])
+    return np.array(chain[::-1], dtype=np.int64)
+
+
+def require_rising(times: NDArray[np.float64], where: Callable[[int], str]) -> None:
+    """Raise InputError if the times are not strictly increasing. The message names the first offending row."""
+    back = np.flatnonzero(np.diff(times) <= 0)
+    if len(back):
+        row = int(back[0]) + 1
+        raise InputError(
+            f"{where(row)}: time {times[row]:.6f} does not lie after {times[row - 1]:.6f} of the line before: "
+            "sort the file by time and take doubles out"
+        )
+
+
+def rows_at_frames(
+    images: ImageSource, source: SourceSettings, path: Path, times: NDArray[np.float64], tracker: TimedPosesSettings
+) -> tuple[dict[str, int], list[str]]:
+    """Associate the selected images with poses by time.
+
+    An image and a pose may differ by at most `tracker.max_difference`. Each is used once; the pairs nearest in time are
+    matched first.
+
+    Args:
+        images: The image source.
+        source: Settings of the images.
+        path: Origin of the poses, for messages.
+        times: Times (N,) of the poses [s], before `tracker.time_offset` is added.
+        tracker: Settings of the tracker.
+
+    Returns:
+        The row of the pose of each matched image, by name in the source's order, and remarks for the user.
+
+    Raises:
+        InputError: If no image has a pose.
+    """
+    names = selected_frames(images, source)
+    of_frames = np.array([images.whole.timestamp(name) for name in names])
+    shifted, remark = _seconds(images, of_frames, path, times, tracker)
+    pairs = associate(of_frames, shifted, tracker.max_difference)
+    if len(pairs) == 0:
+        raise InputError(
+            f"{path}: no pose lies within {tracker.max_difference:g} s of a frame: its times run from "
+            f"{shifted[0]:.6f} to {shifted[-1]:.6f} s, those of the frames from {of_frames.min():.6f} to "
+            f"{of_frames.max():.6f} s; check source.fps, tracker.time_offset and tracker.max_difference"
+        )
+    rows = {names[int(frame)]: int(pose) for frame, pose in pairs}
+    notes = [f"the times of {path.name} {remark}"] if remark else []
+    return rows, [*notes, *missing_frames_note(names, rows, path.name)]
+
+
+def _seconds(
+    images: ImageSource,
+    of_frames: NDArray[np.float64],
+    path: Path,
+    times: NDArray[np.float64],
+    tracker: TimedPosesSettings,
+) -> tuple[NDArray[np.float64], str]:
+    """Return the times of the poses on the images' clock [s], and a remark if the file does not state seconds.
+
+    Numbers of frames and other units are recognised where far more images have a pose then.
+    """
+
+    def count(seconds: NDArray[np.float64]) -> int:
+        return len(associate(of_frames, seconds + tracker.time_offset, tracker.max_difference))
+
+    least = 0.5 * min(len(of_frames), len(times))
+    readings = {"": times}
+    if count(times) < least:
+        readings |= {f"are {unit}": times * factor for unit, factor in UNITS.items()}
+        own = np.array([images.whole.timestamp(name) for name in images.whole.names])
+        first = int(times[-1] == len(own) and times[0] > 0)
+        if times[0] >= 0 and times[-1] - first < len(own) and not (times % 1).any():
+            readings[f"count frames from {first}"] = own[times.astype(np.int64) - first]
+    counts = {remark: count(seconds) for remark, seconds in readings.items()}
+    second, best = sorted(counts, key=lambda remark: counts[remark])[-2:] if len(counts) > 1 else ("", "")
+    if counts[best] <= max(2 * counts[""], least):
+        best = ""
+    elif 2 * counts[second] > counts[best]:
+        raise InputError(f"{path}: its times either {best} or {second}: write them in seconds")
+    return readings[best] + tracker.time_offset, best
+
+
+def replay_trajectory(
+    file: Path,
+    source: SourceSettings,
+    tracker: TrajectorySettings,
+    progress: Progress | None,
+) -> ReplayedTracker:
+    """Open the images that have a pose in a trajectory in TUM's format, in the source's order.
+
+    Args:
+        file: The trajectory.
+        source: Settings of the images.
+        tracker: Settings of the tracker.
+        progress: Called while points are triangulated.
+
+    Raises:
+        InputError: If the trajectory is malformed, its times do not match the images, or as for `replay_poses`.
+    """
+    trajectory = read_trajectory_file(file)  # first, so that a wrong file is reported before images are listed
+    images = open_source(source)
+    rows, notes = rows_at_frames(images, source, file, trajectory.times, tracker)
+    poses = {name: trajectory.T_camera_world[row] for name, row in rows.items()}
+    if trajectory.left_out:
+        of = trajectory.left_out + len(trajectory.times)
+        notes.insert(0, f"{trajectory.left_out} of {of} lines of {file.name} hold NaN or a time out of order: left out")
+    return replay_poses(images, source, tracker, poses, notes, progress)
+
+
+def associate(times_a: ArrayLike, times_b: ArrayLike, max_difference: float = MAX_DIFFERENCE) -> NDArray[np.int64]:
+    """Associate two lists of times greedily: the pair with the smallest difference is taken first.
+
+    Each time is in at most one pair. If two differences are equal, the pair with the lower indices is taken first.
+
+    Args:
+        times_a: Times (N,) [s], in any order.
+        times_b: Times (K,) [s], in any order.
+        max_difference: Largest difference of a pair [s].
+
+    Returns:
+        Pairs (M, 2) of indices into `times_a` and `times_b`, sorted by the first.
+
+    Raises:
+        ValueError: If a time is not finite.
+    """
+    a, b = np.asarray(times_a, dtype=np.float64).ravel(), np.asarray(times_b, dtype=np.float64).ravel()
+    if not (np.isfinite(a).all() and np.isfinite(b).all()):
+        raise ValueError("time stamps must be finite numbers")
+    order = np.argsort(b, kind="stable")
+    first = np.searchsorted(b[order], a - max_difference, side="left")
+    behind = np.searchsorted(b[order], a + max_difference, side="right")
+    if (behind - first).sum() > MANY_PAIRS:
+        at = np.searchsorted(b[order], a)
+        first, behind = np.maximum(first, at - NEAREST), np.minimum(behind, at + NEAREST)
+    count = np.maximum(behind - first, 0)
+    # All candidate pairs: entry i of a with order[first[i]], order[first[i] + 1], ...
+    of_a = np.repeat(np.arange(len(a)), count)
+    step = np.arange(len(of_a)) - np.repeat(np.cumsum(count) - count, count)
+    of_b = order[np.repeat(first, count) + step]
+
+    free_a, free_b = np.ones(len(a), dtype=bool), np.ones(len(b), dtype=bool)
+    pairs = []
+    for k in np.lexsort((of_b, of_a, np.abs(a[of_a] - b[of_b]))):
+        i, j = of_a[k], of_b[k]
+        if free_a[i] and free_b[j]:
+            free_a[i] = free_b[j] = False
+            pairs.append((i, j))
+    return np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2)
+
+
+def open_ground_truth(path: Path | None) -> TimedPoses | None:
+    """Read `source.ground_truth`, a trajectory in TUM format. None if the scene has none.
+
+    Raises:
+        InputError: If the file is missing or malformed.
+    """
+    if path is None:
+        return None
+    if not path.is_file():
+        raise InputError(f"{path}: no such file (source.ground_truth); it should be a trajectory in TUM's format")
+    return read_trajectory_file(path)
+
+
+def true_poses(
+    truth: TimedPoses, timestamps: Sequence[float], before: Before | None = None
+) -> tuple[list[NDArray[np.float64]], str | None]:
+    """Associate a trajectory with frames by time, within `MAX_DIFFERENCE`.
+
+    Args:
+        truth: The true trajectory.
+        timestamps: Times (N,) of the frames [s].
+        before: Frames of an earlier map that come first, which have no true poses; None for none.
+
+    Returns:
+        The true T_camera_world (4, 4) of every frame, NaN where the trajectory has none; empty if fewer than three
+        frames have one. And a note for the user if frames have none.
+    """
+    before = before or Before()
+    own = [time - before.shift for time in timestamps[before.frames :]]
+    pairs = associate(own, truth.times, MAX_DIFFERENCE)
+    note = None
+    if len(pairs) < len(own):
+        note = (
+            f"{len(own) - len(pairs)} of {len(own)} frames have no pose in {truth.path} within "
+            f"{MAX_DIFFERENCE:g} s: not in the trajectory errors"
+        )
+    if len(pairs) < LEAST_FRAMES:
+        return [], note
+    poses = np.full((len(timestamps), 4, 4), np.nan)
+    poses[before.frames + pairs[:, 0]] = truth.T_camera_world[pairs[:, 1]]
+    return list(poses), note

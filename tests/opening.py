@@ -1,0 +1,39 @@
+"""Opening of recordings in tests: trackers by their settings alone, and captures without their images."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from modp_ti.config.settings import SceneConfig, SourceSettings
+from modp_ti.files.file_tree import open_tree
+from modp_ti.inputs.capture import Capture
+from modp_ti.inputs.capture_reader import CaptureSettings
+from modp_ti.inputs.opening import open_tracker
+from modp_ti.inputs.protocol import Progress
+from modp_ti.inputs.reader import TrackerSettings
+from modp_ti.inputs.readers import READERS, SOURCES
+from modp_ti.inputs.replay import ReplayedTracker
+
+__all__ = ["CAPTURES", "opened_with", "read_capture"]
+
+CAPTURES = {kind: reader for kind, reader in READERS.items() if issubclass(reader, CaptureSettings)}
+
+
+def opened_with(
+    source: SourceSettings,
+    tracker: TrackerSettings,
+    progress: Progress | None = None,
+    output: Path = Path("out"),
+    seed: int = 0,
+) -> ReplayedTracker:
+    """The tracker of these settings."""
+    opened = open_tracker(SceneConfig(source=source, tracker=tracker, output=output, seed=seed), progress)
+    assert isinstance(opened, ReplayedTracker)
+    return opened
+
+
+def read_capture(path: Path, kind: str) -> Capture:
+    """The frames of a capture."""
+    reader = SOURCES[kind]
+    assert issubclass(reader, CaptureSettings)
+    return reader.read(next(tree for tree in open_tree(path) if reader.recognises(tree)))
