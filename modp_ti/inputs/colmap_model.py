@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -79,11 +79,8 @@ class ColmapModel:
     xyz: NDArray[np.float64]
 
     def positions(self, ids: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the positions (N, 3) of points by their ids (N,). Raises InputError if the model lacks one."""
-        rows = np.minimum(np.searchsorted(self.ids, ids), max(len(self.ids) - 1, 0))
-        if len(ids) and (len(self.ids) == 0 or (self.ids[rows] != ids).any()):
-            raise InputError("points3D of a COLMAP model is incomplete: an image observes points that it lacks")
-        return self.xyz[rows]
+        """Return the positions (N, 3) of points by their ids (N,)."""
+        return self.xyz[np.searchsorted(self.ids, ids)]
 
 
 def read_colmap_model(folder: Path, posed_alone: bool = False) -> ColmapModel:
@@ -108,11 +105,18 @@ def read_colmap_model(folder: Path, posed_alone: bool = False) -> ColmapModel:
     readers = (_cameras, _images, _points) if there[0] == ".bin" else (_text_cameras, _text_images, _text_points)
     files = [folder / f"{stem}{there[0]}" for stem in STEMS]
     cameras, images = dict(readers[0](files[0])), dict(readers[1](files[1]))
-    points = dict(readers[2](files[2])) if whole else {}
+    points, observers = {}, set[int]()
+    for number, xyz, track in readers[2](files[2]) if whole else ():
+        points[number] = xyz
+        observers.update(track)
     ids = np.array(sorted(points), dtype=np.int64)
-    lost = next((image for image in images.values() if image.camera not in cameras), None)
-    if lost is not None:
-        raise InputError(f"{files[1]}: image {lost.name} is of camera {lost.camera}, which the COLMAP model lacks")
+    for image in images.values():
+        if image.camera not in cameras:
+            raise InputError(f"{files[0]}: lacks camera {image.camera} of image {image.name}; export the model again")
+        if not np.isin(image.ids, ids).all() and whole:
+            raise InputError(f"{files[2]}: is incomplete: image {image.name} observes points that it lacks")
+    if observers - images.keys() and any(len(image.ids) for image in images.values()):
+        raise InputError(f"{files[1]}: is incomplete: it lacks images that observe points; export the model again")
     return ColmapModel(cameras, images, ids, np.array([points[i] for i in ids.tolist()]).reshape(-1, 3))
 
 
@@ -192,12 +196,12 @@ def _images(file: Path) -> Iterator[tuple[int, ModelImage]]:
         yield number, _image(str(file), tuple(pose), camera, name, seen["pixel"], seen["point"])
 
 
-def _points(file: Path) -> Iterator[tuple[int, tuple[float, ...]]]:
+def _points(file: Path) -> Iterator[tuple[int, tuple[float, ...], Sequence[int]]]:
     cursor = _Cursor(file)
     for _ in cursor.records():
         number, *xyz, count = cursor.read("<q3d3x8xQ")  # id, position, colour, error, length of the track
         cursor.skip(count * 8)  # image, observation
-        yield number, tuple(xyz)
+        yield number, tuple(xyz), ()  # the ends of binary files are checked
 
 
 def _text_cameras(file: Path) -> Iterator[tuple[int, ModelCamera]]:
@@ -243,12 +247,12 @@ def _observations(line: str) -> NDArray[np.float64] | None:
         return None
 
 
-def _text_points(file: Path) -> Iterator[tuple[int, tuple[float, ...]]]:
+def _text_points(file: Path) -> Iterator[tuple[int, tuple[float, ...], Sequence[int]]]:
     for number, line in _lines(file):
         words = line.split(maxsplit=8)
         try:
-            _ = words[7]
-            yield int(words[0]), tuple(map(float, words[1:4]))
+            track = words[8].split()[::2] if len(words) > 8 else []
+            yield int(words[0]), tuple(map(float, (words[1], words[2], words[3], words[7])))[:3], list(map(int, track))
         except (ValueError, IndexError):
             raise InputError(
                 f"{file}:{number}: no line of a point (id x y z r g b error); export the model again"
