@@ -60,8 +60,8 @@ class SfmSettings(TrackerSettings):
     def open(self, scene: SceneConfig, progress: Progress | None = None) -> ReplayedTracker:
         """Reconstruct the selected images, or take the model of an earlier run on the same images and settings.
 
-        The faces of a panorama are placed together, as a rig. The model is in `sfm` in the output folder: a COLMAP model with a fingerprint. Fewer than three images that
-        belong together raise InputError.
+        The faces of a panorama are placed together, as a rig. The model is in `sfm` in the output folder: a COLMAP
+        model with a fingerprint. Fewer than three images that belong together raise InputError.
         """
         source, folder, seed = scene.source, scene.output / "sfm", scene.seed
         images = open_source(source)
