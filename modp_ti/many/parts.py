@@ -16,10 +16,10 @@ from fields.map.covisibility import SeenPoints, covisibility
 from modp_ti.config.settings import SceneConfig
 from modp_ti.files.errors import InputError
 from modp_ti.files.run_folder import appearing, run_folder
+from modp_ti.inputs.opening import open_tracker
 from modp_ti.inputs.protocol import Tracker
 from modp_ti.inputs.replay import ReplayedTracker
 from modp_ti.inputs.scene_paths import refuse_output_in_input
-from modp_ti.inputs.trackers import open_tracker
 from modp_ti.many.batch import LOGS, run_batch
 from modp_ti.many.pool import open_pool
 from modp_ti.many.scenes import Scene, for_a_task, with_store
