@@ -15,8 +15,8 @@ from fields.geometry.camera import PinholeCamera
 from modp_ti.config.settings import SourceSettings
 from modp_ti.inputs.readers.colmap import ColmapSettings
 from modp_ti.inputs.tracked_points import TrackedPoints
-from tests.opening import opened_with
 from modp_ti.outputs.formats.dataset import image_names, write_colmap, write_image
+from tests.opening import opened_with
 
 CAMERAS = [PinholeCamera(50.0, 51.0, 20.5, 14.0, 40, 30), PinholeCamera(55.0, 55.0, 20.0, 15.0, 40, 30)]
 NAMES = ["left/frame2.jpg", "left/frame10.jpg", "right/a.png"]
