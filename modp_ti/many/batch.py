@@ -14,14 +14,20 @@ from modp_ti.engine.interruption import Interruption
 from modp_ti.files.errors import InputError
 from modp_ti.files.run_folder import appearing
 from modp_ti.files.urls import shown_url
-from modp_ti.many.finished import fetch_finished, finished_metrics
 from modp_ti.many.pool import Ended, Pool, Resources, Running
-from modp_ti.many.progress_table import ProgressTable
-from modp_ti.many.results import SceneResult, State, figures, write_csv, write_parquet, write_summary_page
-from modp_ti.many.scenes import Scene, with_resources
+from modp_ti.many.results import (
+    ProgressTable,
+    SceneResult,
+    State,
+    figures,
+    write_csv,
+    write_parquet,
+    write_summary_page,
+)
+from modp_ti.many.scenes import Scene, fetch_finished, finished_metrics
 from modp_ti.many.task import PATIENCE, End
 
-__all__ = ["Shares", "run_batch"]
+__all__ = ["Shares", "run_batch", "with_resources"]
 
 CSV, PARQUET, PAGE, LOGS = "batch.csv", "batch.parquet", "index.html", "logs"
 # Longest wait for an event [s]: how often the table is brought up to date at least.
@@ -53,6 +59,15 @@ class Shares:
         if gpus is None:
             gpus = 0.0 if config.device in ("cpu", "auto") else 1.0
         return Resources(cpus, gpus, self.memory)
+
+
+def with_resources(config: SceneConfig, resources: Resources) -> SceneConfig:
+    """Return a scene's settings for a process that has these resources: as many threads as cores, no GPU without one.
+
+    A number of threads that the scene sets is kept.
+    """
+    threads = config.threads or max(1, int(resources.cpus))
+    return config.model_copy(update={"threads": threads, "device": config.device if resources.gpus else "cpu"})
 
 
 def run_batch(

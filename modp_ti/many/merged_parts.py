@@ -14,9 +14,9 @@ from modp_ti.engine.snapshots.snapshot import StreamDigest
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.protocol import Tracker
 from modp_ti.inputs.replay import ReplayedTracker
-from modp_ti.many.finished import finished_metrics
 from modp_ti.many.parts import Part, part_config, parts_of, steps_in_part
 from modp_ti.many.results import figures, last_stage
+from modp_ti.many.scenes import finished_metrics
 from modp_ti.outputs.formats.run_files import read_exposures
 from modp_ti.outputs.playback.finished_run import FinishedRun, open_run
 from pipelines.settings import RefineSettings

@@ -1,21 +1,41 @@
-"""`Scene`: a recording of a batch with its settings, read from what the user named."""
+"""`Scene`: a recording of a batch with its settings, and how its finished run is recognised by what that has left."""
 
 from __future__ import annotations
 
+import tempfile
 import zlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
+from modp_ti.config.keys import differing_keys
+from modp_ti.config.scene_file import load_scene
 from modp_ti.config.settings import SceneConfig, ViewSettings
+from modp_ti.files import read_json
 from modp_ti.files.errors import InputError
+from modp_ti.files.run_folder import appearing, require_whole
+from modp_ti.files.storage import Storage
 from modp_ti.files.urls import actual_url, shown_url
 from modp_ti.inputs.bare_recording import base_of, named_scene
 from modp_ti.inputs.scene_paths import refuse_output_in_input
-from modp_ti.many.pool import Resources
 
-__all__ = ["SNAPSHOT_EVERY", "Scene", "for_a_task", "read_scenes", "with_resources", "with_store"]
+__all__ = [
+    "OUTPUT",
+    "SNAPSHOT_EVERY",
+    "Scene",
+    "fetch_finished",
+    "finished_metrics",
+    "for_a_task",
+    "read_scenes",
+    "with_store",
+]
 
+# Settings on which neither the map nor the other output files depend, but for the device, in the last digits.
+FREE = ("output", "device", "threads", "snapshot_every", "snapshot_store", "source.prefetch", "view")
+# Folder of the finished run's files within the scene's storage.
+OUTPUT = "output"
+METRICS, SETTINGS = "metrics.json", "config.yaml"
 # Frames between snapshots where the scene does not set `snapshot_every`.
 SNAPSHOT_EVERY = 50
 
@@ -91,15 +111,6 @@ def _numbered(name: str, number: int) -> str:
     return name if number == 1 else f"{name}-{number}"
 
 
-def with_resources(config: SceneConfig, resources: Resources) -> SceneConfig:
-    """Return a scene's settings for a process that has these resources: as many threads as cores, no GPU without one.
-
-    A number of threads that the scene sets is kept.
-    """
-    threads = config.threads or max(1, int(resources.cpus))
-    return config.model_copy(update={"threads": threads, "device": config.device if resources.gpus else "cpu"})
-
-
 def with_store(scenes: Iterable[Scene], url: str) -> list[Scene]:
     """Return scenes whose snapshots are copied to folders of their own below a URL.
 
@@ -113,3 +124,62 @@ def with_store(scenes: Iterable[Scene], url: str) -> list[Scene]:
             scene = replace(scene, config=scene.config.model_copy(update={"snapshot_store": own}))
         stored.append(scene)
     return stored
+
+
+# ---- finished runs --------------------------------------------------------------------------------------------------
+
+
+def finished_metrics(config: SceneConfig) -> dict[str, Any] | None:
+    """Return the metrics of a finished run with these settings in `config.output`, None if there is none.
+
+    A run with further maps (`tracker.maps: all`) is finished when all of them are.
+    """
+    try:
+        require_whole(config.output)
+        metrics = read_json(config.output / METRICS, METRICS)
+        written = load_scene(config.output / SETTINGS)
+        further = int(metrics.get("further_maps", 0))
+    except (InputError, AttributeError, TypeError, ValueError):
+        return None
+    if not _same(written, config):
+        return None
+    maps = [config.of_map(place).output / METRICS for place in range(2, 2 + further)]
+    return metrics if all(file.is_file() for file in maps) else None
+
+
+def fetch_finished(config: SceneConfig) -> bool:
+    """Copy the files of a finished run from `snapshot_store` to the output folder, unless it has them already.
+
+    Returns:
+        Whether the output folder now holds a finished run of these settings.
+
+    Raises:
+        InputError: If the storage cannot be read, or the output folder not be written.
+    """
+    if finished_metrics(config) is not None or not config.snapshot_store:
+        return finished_metrics(config) is not None
+    storage = Storage(config.snapshot_store).within(OUTPUT)
+    if not _is_stored(config, storage):
+        return False
+    with appearing(config.output) as folder:
+        storage.get_folder(folder)
+    return finished_metrics(config) is not None
+
+
+def _is_stored(config: SceneConfig, storage: Storage) -> bool:
+    """Whether a storage holds a finished run with these settings. Raises StorageError if it cannot be read."""
+    with tempfile.TemporaryDirectory(prefix="modp-ti-batch-") as folder:
+        file = Path(folder) / SETTINGS
+        if not storage.has(METRICS) or not storage.get(SETTINGS, file):
+            return False
+        try:
+            return _same(load_scene(file), config)
+        except InputError:
+            return False
+
+
+def _same(written: SceneConfig, config: SceneConfig) -> bool:
+    scale = written.source.scale
+    if scale != "auto":  # the run's number, which `auto` in the scene file became
+        config = config.resolved(scale)
+    return not differing_keys(written.model_dump(mode="json"), config.model_dump(mode="json"), FREE)

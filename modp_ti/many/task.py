@@ -21,7 +21,7 @@ from modp_ti.files.child_environment import child_environment
 from modp_ti.files.errors import InputError
 from modp_ti.files.sole_use import sole_use
 from modp_ti.files.storage import Storage, StorageError
-from modp_ti.many.finished import OUTPUT, finished_metrics
+from modp_ti.many.scenes import OUTPUT, finished_metrics
 from modp_ti.outputs.progress import StageProgress
 
 __all__ = ["PATIENCE", "End", "TaskProcess", "carry_out"]

@@ -8,7 +8,7 @@ import pytest
 
 from modp_ti.config.scene_file import dump_scene, load_scene
 from modp_ti.config.settings import SceneConfig
-from modp_ti.many.finished import finished_metrics
+from modp_ti.many.scenes import finished_metrics
 
 
 @pytest.fixture

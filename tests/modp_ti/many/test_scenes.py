@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from modp_ti.many.batch import with_resources
 from modp_ti.many.pool import Resources
-from modp_ti.many.scenes import SNAPSHOT_EVERY, read_scenes, with_resources, with_store
+from modp_ti.many.scenes import SNAPSHOT_EVERY, read_scenes, with_store
 
 SCENE = "source: {path: images}\ntracker: {kind: colmap}\noutput: OUT\n"
 
