@@ -10,6 +10,7 @@ import io
 import tarfile
 import warnings
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 from threading import Thread
 
@@ -19,7 +20,7 @@ from modp_ti.config.scene_file import load_scene
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.opening import open_tracker
 from tests.fault_injection.samples import SAMPLES, write_sample
-from tests.modp_ti.inputs.tracker_server.clients import connect, opened
+from tests.modp_ti.inputs.tracker_server.clients import END, FRAME, HELLO, connect, frame, hello, message, opened
 
 ARCHIVE = Path(__file__).with_name("corpus.tar.xz")
 ALONE = {"weights": ("weights.pth", "older.pth"), "tracker_server": ("wire",)}
@@ -89,11 +90,16 @@ def _read(kind: str, file: Path, folder: Path) -> None:
 
 
 def _converse(path: Path, data: bytes) -> None:
-    """Send what a tracker says, and take in all frames that come of it."""
+    """Send what a tracker says, and take in all frames that come of it.
+
+    A bad start is dropped, and the server waits for the next tracker: one that behaves follows.
+    """
+    behaves = message(HELLO, hello()) + message(FRAME, frame(1)) + message(FRAME, frame(2)) + message(END)
 
     def say() -> None:
-        with connect(path) as connection:
-            connection.sendall(data)
+        for content in (data, behaves):
+            with suppress(OSError), connect(path) as connection:  # nobody listens after a whole conversation
+                connection.sendall(content)
 
     with opened(path) as tracker:
         thread = Thread(target=say)
