@@ -171,7 +171,7 @@ def play(
             sender.pose(*waiting.popleft())
 
     try:
-        for event in tracker.events():
+        for event in tracker:
             if isinstance(event, PoseCorrection):
                 assert sender is not None, "frames come before their corrections"
                 send_poses(0)  # the frames that it revises must have poses

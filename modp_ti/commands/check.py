@@ -65,6 +65,7 @@ def inspect_scene(config: SceneConfig, console: Console) -> dict[str, Any]:
     Returns:
         Verdict, findings and measurements as plain data for JSON.
     """
+    from modp_ti.inputs.delivered_frames import settled
     from modp_ti.inputs.inspection.findings import judge_scale, judge_sequence, measure_scale
     from modp_ti.inputs.inspection.geometry import judge_geometry, measure_geometry
     from modp_ti.inputs.inspection.report import judged, measured
@@ -79,7 +80,7 @@ def inspect_scene(config: SceneConfig, console: Console) -> dict[str, Any]:
             config = config.model_copy(update={"output": output})
         tracker = open_tracker(config, line.prepare)
         held.callback(tracker.close)
-        frames = iter(tracker)
+        frames = settled(tracker)
         first = next(frames, None)
         if first is None:
             raise InputError("the tracker delivered no frame: nothing to check")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -89,6 +90,8 @@ def compile_size(config: SceneConfig, size: tuple[int, int] | None) -> tuple[str
     from fields.runtime.backend import initialise
     from modp_ti.engine.build import EXPECTED, build_mapper
     from modp_ti.inputs.opening import open_tracker
+    from modp_ti.engine.conductor import first_frame
+    from modp_ti.engine.prefetch import FramesAhead
 
     try:
         backend = initialise(config.device, config.threads, config.seed)
@@ -99,10 +102,8 @@ def compile_size(config: SceneConfig, size: tuple[int, int] | None) -> tuple[str
     elif size is None and config.tracker.is_live:
         raise InputError("no frame is there before a tracker sends one: give the size, --size 640x480")
     elif size is None:
-        first = next(iter(open_tracker(config.without_clock())), None)
-        if first is None:
-            raise InputError("the tracker delivered no frame: nothing to compile for")
-        camera = first.camera
+        with closing(open_tracker(config.without_clock())) as tracker:
+            camera = first_frame(FramesAhead(tracker, 0)).camera
     else:
         width, height = size
         camera = PinholeCamera(float(width), float(width), width / 2, height / 2, width, height)

@@ -13,15 +13,14 @@ from modp_ti.engine.interruption import Interruption
 from modp_ti.engine.mapper import Mapper
 from modp_ti.engine.prefetch import FramesAhead
 from modp_ti.files.errors import InputError
+from modp_ti.inputs.protocol import Event
 from modp_ti.outputs.progress import LiveStatus
 from pipelines.companions.pace import Pace
 from pipelines.pipeline import FrameReport
 from pipelines.refinement import Schedule, in_seconds
 from pipelines.settings import RefineSettings
 
-__all__ = ["Conductor", "Event", "first_frame", "fitting"]
-
-Event = TrackedFrame | PoseCorrection
+__all__ = ["Conductor", "first_frame", "fitting"]
 
 
 def first_frame(arriving: FramesAhead[Event]) -> TrackedFrame:

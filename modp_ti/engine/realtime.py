@@ -13,13 +13,12 @@ import numpy as np
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
 from modp_ti.config.settings import SceneConfig
-from modp_ti.engine.conductor import Conductor, Event
+from modp_ti.engine.conductor import Conductor
 from modp_ti.engine.interruption import Interruption
 from modp_ti.engine.mapper import Mapper
 from modp_ti.engine.prefetch import FramesAhead
 from modp_ti.engine.recording import FILE, SessionRecorder
-from modp_ti.inputs.live_counts import LiveCounts
-from modp_ti.inputs.protocol import Tracker
+from modp_ti.inputs.protocol import Event, LiveCounts, Tracker
 from modp_ti.outputs.progress import LiveStatus
 from pipelines.companions.realtime_pace import RealtimePace
 from pipelines.pipeline import FrameReport

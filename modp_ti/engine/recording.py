@@ -7,7 +7,7 @@ import json
 import shutil
 import tempfile
 import zipfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import reduce
 from pathlib import Path
@@ -21,14 +21,15 @@ from fields.frames.camera_revision import CameraRevision
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from fields.geometry.camera import PinholeCamera
-from modp_ti.engine.conductor import Conductor, Event
+from modp_ti.engine.conductor import Conductor
 from modp_ti.engine.interruption import Interruption
 from modp_ti.engine.mapper import Mapper
 from modp_ti.engine.prefetch import FramesAhead
 from modp_ti.files.errors import InputError
 from modp_ti.files.limits import BoundedZip, arrays_of
 from modp_ti.files.reading import reading
-from modp_ti.inputs.protocol import Tracker
+from modp_ti.inputs.protocol import Event, Tracker
+from modp_ti.inputs.sources import Picture
 from modp_ti.inputs.sources.image_header import why_undecodable
 from modp_ti.inputs.sources.image_pixels import decoded_as
 from pipelines.companions.pace import Plan
@@ -179,6 +180,7 @@ class RecordedSession(Tracker):
     """
 
     reads_ahead: ClassVar[bool] = True
+    corrects: ClassVar[bool] = True
 
     def __init__(self, output: Path) -> None:
         self.path = output / FILE
@@ -215,15 +217,16 @@ class RecordedSession(Tracker):
     def frame_count(self) -> int:
         return len(self._names) - len(self.more)
 
-    def __iter__(self) -> Iterator[TrackedFrame]:
-        later = list(self._revisions)
-        for event in self.events():
-            if isinstance(event, TrackedFrame):
-                yield reduce(TrackedFrame.with_camera, later, event)
-            elif event.camera is not None:
-                del later[0]
+    def pictures(self, names: Sequence[str]) -> Iterator[tuple[str, Picture]]:
+        later, wanted = list(self._revisions), set(names)
+        for event in self:
+            if isinstance(event, PoseCorrection):
+                del later[: event.camera is not None]
+            elif event.name in wanted:
+                frame = reduce(TrackedFrame.with_camera, later, event)
+                yield frame.name, Picture(frame.image, frame.mask, frame.vignette, frame.camera)
 
-    def events(self) -> Iterator[Event]:
+    def __iter__(self) -> Iterator[Event]:
         vignette = None
         for name in self._names:
             with reading(self.path, AGAIN):

@@ -79,7 +79,7 @@ class SecondVisit(EarlierMap):
         Raises:
             InputError: If the recording cannot be located.
         """
-        config, run, events = self._config, self._run, tracker.events()
+        config, run, events = self._config, self._run, iter(tracker)
         locator = Locator(run.folder, config.device, self._line.console)
         taken, self._alignment = _settled(locator, events, self._line)
         initialise(config.device, config.mapper_threads, config.seed)  # frees what the locator has taken

@@ -19,7 +19,7 @@ from fields.runtime import process
 from fields.runtime.backend import describe, initialise
 from modp_ti.config.settings import SceneConfig
 from modp_ti.engine.build import EXPECTED, build_mapper, open_conductor, open_earlier_map, open_observer
-from modp_ti.engine.conductor import Conductor, Event, first_frame, fitting
+from modp_ti.engine.conductor import Conductor, first_frame, fitting
 from modp_ti.engine.earlier_map import EarlierMap
 from modp_ti.engine.interruption import Interruption, RunStopped
 from modp_ti.engine.mapper import Mapper
@@ -38,6 +38,7 @@ from modp_ti.files.urls import without_secrets
 from modp_ti.inputs.inspection.geometry import require_fitting
 from modp_ti.inputs.opening import open_tracker
 from modp_ti.inputs.protocol import Tracker
+from modp_ti.inputs.protocol import Event
 from modp_ti.inputs.replay import ReplayedTracker
 from modp_ti.inputs.scene_paths import refuse_output_in_input
 from modp_ti.inputs.timed_poses import open_ground_truth, true_poses
@@ -163,7 +164,7 @@ class _Session:
         self.config = self.config.resolved(self.tracker.scale)
         # At least one frame in a realtime run, so that the mapper sees whether a frame waits.
         self.ahead = max(self.config.source.prefetch if self.tracker.reads_ahead else 0, self.config.is_realtime)
-        with FramesAhead(self.tracker.events(), self.ahead) as arriving:
+        with FramesAhead(self.tracker, self.ahead) as arriving:
             undistorter = self.tracker.undistorter if self.config.is_realtime else None
             if undistorter is not None:  # larger images than expected: while the first frames are tracked
                 self._make_mapper(undistorter.camera)
@@ -360,8 +361,8 @@ class _Session:
         pipeline, frames = self.mapper.pipeline, self.mapper.frames
         self.line.start("evaluating the saved map", len(frames) * len(versions))
         try:
-            with pipeline.stopwatch.measure("evaluate"), FramesAhead(self.tracker, self.ahead) as again:
-                mapped = self.checkpointer.digest.known(again, frames)
+            with pipeline.stopwatch.measure("evaluate"), FramesAhead(frames.again(self.tracker), self.ahead) as again:
+                mapped = filter(self.checkpointer.digest.has_image_of, again)
                 scores = evaluate(pipeline, mapped, versions, self.lpips, keep)
         finally:
             self.line.stop()

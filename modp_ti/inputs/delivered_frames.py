@@ -1,21 +1,22 @@
-"""The record that a run keeps of every frame delivered by its tracker."""
+"""The log that a run keeps of every frame that its tracker delivered, with all corrections."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fields.frames.origin import NO_ORIGIN
 from fields.frames.pose_correction import PoseCorrection
-from fields.frames.tracked_frame import TrackedFrame
+from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from fields.map.trajectory import Trajectory
+from modp_ti.inputs.protocol import Tracker
 from modp_ti.inputs.tracked_points import TrackedPoints
 
-__all__ = ["DeliveredFrames"]
+__all__ = ["DeliveredFrames", "settled"]
 
 
 @dataclass
@@ -93,3 +94,50 @@ class DeliveredFrames:
             self.points.revise_camera(correction.camera)
         self.corrections["received"] += 1
         self.corrections["moved"] += moved
+
+    def again(self, tracker: Tracker) -> Iterator[TrackedFrame]:
+        """Read the images of the frames again. Frames have their latest tracked poses and points.
+
+        Args:
+            tracker: The tracker that delivered the frames. Those whose images it can no longer read are left out.
+        """
+        places, ids, xyz = {name: place for place, name in enumerate(self.name)}, self.points.ids, self.points.xyz
+        for name, picture in tracker.pictures(self.name):
+            place = places[name]
+            rows, pixels = self.points.rows[place], self.points.pixels[place].astype(np.float64)
+            yield TrackedFrame(
+                index=self.index[place],
+                timestamp=self.timestamp[place],
+                name=name,
+                image=picture.image,
+                camera=self.camera[place],
+                T_camera_world=self.trajectory[self.index[place]],
+                points=SparsePoints(xyz[rows], pixels, ids[rows]),
+                mask=picture.mask,
+                vignette=picture.vignette,
+                held_out=self.held_out[place],
+            )
+
+
+def settled(tracker: Tracker) -> Iterator[TrackedFrame]:
+    """Iterate over the frames of a tracker with the poses and points that it has at its end.
+
+    The images of a tracker that corrects poses are read twice.
+    """
+    if not tracker.corrects:
+        for event in tracker:
+            assert isinstance(event, TrackedFrame), "it corrects nothing"
+            yield event
+        return
+    from fields.map.keyframes import KeyframeStore  # here, so that other trackers are checked without the engine
+    from pipelines.corrections import revise
+
+    log, views = DeliveredFrames(), 1
+    for event in tracker:
+        if isinstance(event, TrackedFrame):
+            log.add(event)
+            views = event.views
+        else:
+            log.correct(event, revise(KeyframeStore(trajectory=log.trajectory), event), moved=False)
+    for frame in log.again(tracker):
+        yield replace(frame, views=views)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain
 from typing import TYPE_CHECKING, ClassVar, Protocol
 
 import numpy as np
@@ -14,10 +13,10 @@ from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.similarity import moved_points, moved_pose
 from modp_ti.files.errors import InputError, UnreadableImageError
-from modp_ti.inputs.protocol import Before, Tracker
+from modp_ti.inputs.protocol import Before, Event, Tracker
 
 if TYPE_CHECKING:
-    from modp_ti.inputs.sources import Undistorter
+    from modp_ti.inputs.sources import Picture, Undistorter
 
 __all__ = ["EarlierFrames", "JoinedTracker", "Placement", "prefix_for", "shift_after"]
 
@@ -26,11 +25,13 @@ GAP = 1.0
 
 
 class EarlierFrames(Protocol):
-    """The frames of the earlier map, in its world. They are iterated over twice."""
+    """The frames of the earlier map, in its world."""
 
     def __len__(self) -> int: ...
 
     def __iter__(self) -> Iterator[TrackedFrame]: ...
+
+    def pictures(self, names: Sequence[str]) -> Iterator[tuple[str, Picture]]: ...
 
     @property
     def size(self) -> tuple[int, int]: ...
@@ -98,14 +99,15 @@ class JoinedTracker(Tracker):
     """
 
     reads_ahead: ClassVar[bool] = True
+    corrects: ClassVar[bool] = True
 
     def __init__(
         self,
         earlier: EarlierFrames,
         tracker: Tracker,
         placement: Placement,
-        taken: Sequence[TrackedFrame | PoseCorrection],
-        rest: Iterator[TrackedFrame | PoseCorrection],
+        taken: Sequence[Event],
+        rest: Iterator[Event],
     ) -> None:
         self._earlier = earlier
         self._tracker = tracker
@@ -121,17 +123,20 @@ class JoinedTracker(Tracker):
     def notes(self) -> list[str]:
         return self._tracker.notes
 
-    def events(self) -> Iterator[TrackedFrame | PoseCorrection]:
+    def __iter__(self) -> Iterator[Event]:
         """Iterate once over the earlier frames, and over the new frames and their corrections."""
         yield from self._earlier
         while self._taken:  # the waiting images are released one by one
             yield self._placed(self._taken.pop(0))
         yield from map(self._placed, self._rest)
 
-    def __iter__(self) -> Iterator[TrackedFrame]:
-        return chain(self._earlier, map(self._placement.frame, self._tracker))
+    def pictures(self, names: Sequence[str]) -> Iterator[tuple[str, Picture]]:
+        prefix = self._placement.prefix
+        own = [name.removeprefix(prefix) for name in names if name.startswith(prefix)]
+        yield from self._earlier.pictures([name for name in names if not name.startswith(prefix)])
+        yield from ((f"{prefix}{name}", picture) for name, picture in self._tracker.pictures(own))
 
-    def _placed(self, event: TrackedFrame | PoseCorrection) -> TrackedFrame | PoseCorrection:
+    def _placed(self, event: Event) -> Event:
         return self._placement.frame(event) if isinstance(event, TrackedFrame) else self._placement.correction(event)
 
     @property

@@ -1,9 +1,9 @@
-"""The `Tracker` base class."""
+"""The `Tracker` base class, and the counts of one that follows a clock."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
@@ -13,12 +13,14 @@ from numpy.typing import NDArray
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
 from modp_ti.files.errors import UnreadableImageError
-from modp_ti.inputs.live_counts import LiveCounts
 
 if TYPE_CHECKING:
-    from modp_ti.inputs.sources import Undistorter
+    from modp_ti.inputs.sources import Picture, Undistorter
 
-__all__ = ["Before", "Progress", "Tracker"]
+__all__ = ["Before", "Event", "LiveCounts", "Progress", "Tracker"]
+
+Event = TrackedFrame | PoseCorrection
+"""What a tracker delivers: the next frame, or a correction of earlier ones."""
 
 Progress = Callable[[str, int, int], None]
 """Progress callback, called as progress(what, done, total) while a tracker prepares."""
@@ -41,17 +43,40 @@ class Before:
     shift: float = 0.0
 
 
+@dataclass(frozen=True)
+class LiveCounts:
+    """What a tracker that follows a clock has done so far.
+
+    Attributes:
+        arrived: Number of frames received.
+        tracked: Number of frames that were given a pose.
+        thinned: Number of frames that were left out evenly before tracking.
+        lost: Number of frames that the tracker could not place.
+        waiting: Number of frames that wait for the mapper now.
+        newest: `time.monotonic()` when the newest frame was received [s].
+    """
+
+    arrived: int
+    tracked: int
+    thinned: int
+    lost: int
+    waiting: int
+    newest: float
+
+
 class Tracker(ABC):
     """Base class of trackers: delivers frames in order and decodes each one on demand.
 
-    Subclasses must implement `notes` and `__iter__`. Every other method has a default. For example, a tracker that
-    revises poses overrides `events`, and a tracker that holds a camera or a socket open overrides `close`. Callers use
-    this interface only.
+    Subclasses must implement `notes`, `__iter__` and `pictures`. Every other member has a default. For example, a
+    tracker that holds a camera or a socket open overrides `close`. Callers use this interface only.
     """
 
     reads_ahead: ClassVar[bool] = False
     """Whether a second thread may iterate over the tracker while the mapper runs. Such a tracker must not launch
     Taichi kernels, because only one thread may do so."""
+
+    corrects: ClassVar[bool] = False
+    """Whether corrections of earlier frames may come between the frames."""
 
     @property
     @abstractmethod
@@ -62,18 +87,23 @@ class Tracker(ABC):
         """
 
     @abstractmethod
-    def __iter__(self) -> Iterator[TrackedFrame]:
-        """Iterate over the frames in order.
-
-        If the tracker revised poses, each frame has its latest pose.
+    def __iter__(self) -> Iterator[Event]:
+        """Iterate once over the frames in order, and over corrections of earlier ones between them.
 
         Raises:
             InputError: If the input is invalid.
         """
 
-    def events(self) -> Iterator[TrackedFrame | PoseCorrection]:
-        """Iterate over frames, interleaved with corrections of earlier frames. A live tracker delivers them once."""
-        return iter(self)
+    @abstractmethod
+    def pictures(self, names: Sequence[str]) -> Iterator[tuple[str, Picture]]:
+        """Read images of delivered frames again, as frames delivered after the last event would show them.
+
+        Args:
+            names: Names of the frames, in the order in which they were delivered.
+
+        Yields:
+            Name and picture of each frame whose image can still be read, in order.
+        """
 
     @property
     def frame_count(self) -> int | None:

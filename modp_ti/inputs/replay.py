@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -15,7 +14,7 @@ from fields.frames.origin import far_origin
 from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from modp_ti.files.errors import FEW, InputError, UnreadableImageError
 from modp_ti.inputs.protocol import Tracker
-from modp_ti.inputs.sources import FrameReader, ImageSource, Undistorter
+from modp_ti.inputs.sources import FrameReader, ImageSource, Picture, Undistorter
 
 if TYPE_CHECKING:
     from modp_ti.config.settings import SourceSettings
@@ -26,8 +25,8 @@ __all__ = [
     "ReplayedTracker",
     "Unreadable",
     "is_held_out",
+    "pictures_again",
     "points_inside",
-    "read_again",
     "readable_sizes",
     "tracked_frame",
 ]
@@ -60,8 +59,7 @@ class ReplayedTracker(Tracker):
     """A `Tracker` that replays posed images in the given order.
 
     Points on masked pixels are dropped. Damaged images are skipped, up to a share `FEW` of all images. Whether a frame
-    is held out depends on its position among all given images, including damaged ones. A later iteration delivers the
-    frames of the first one that can still be read, with the same indices, and no others.
+    is held out depends on its position among all given images, including damaged ones.
 
     Args:
         reader: Reads and undistorts the images.
@@ -75,8 +73,6 @@ class ReplayedTracker(Tracker):
         self.frames = tuple(frames)
         self._notes = [*notes, *reader.images.notes]
         self._unreadable = Unreadable()
-        self._noted = False
-        self._indices: dict[int, int] = {}  # of the delivered frames, by place
         self._reader = reader
         self._part = range(len(self.frames))
 
@@ -149,22 +145,22 @@ class ReplayedTracker(Tracker):
         self._reader.images.close()
 
     def __iter__(self) -> Iterator[TrackedFrame]:
+        index = 0
         for place in self._part:
-            frame, index = self.frames[place], self._indices.get(place, len(self._indices))
-            read = partial(tracked_frame, self._reader, index, frame, place)
-            if place in self._indices:
-                yield from read_again(read)
-            elif frame.name not in self._unreadable:
-                try:
-                    tracked = read()
-                except UnreadableImageError as error:
-                    self._unreadable.add(frame.name, error, len(self.frames))
-                    continue
-                self._indices[place] = index
-                yield tracked
-        if self._unreadable and not self._noted:
-            self._noted = True
+            frame = self.frames[place]
+            try:
+                tracked = tracked_frame(self._reader, index, frame, place)
+            except UnreadableImageError as error:
+                self._unreadable.add(frame.name, error, len(self.frames))
+                continue
+            index += 1
+            yield tracked
+        if self._unreadable:
             self._notes.append(self._unreadable.note(len(self.frames)))
+
+    def pictures(self, names: Sequence[str]) -> Iterator[tuple[str, Picture]]:
+        undistorter = {frame.name: frame.undistorter for frame in self.frames}
+        return pictures_again(self._reader, ((name, undistorter[name]) for name in names if name in undistorter))
 
 
 class Unreadable(dict[str, UnreadableImageError]):
@@ -182,13 +178,19 @@ class Unreadable(dict[str, UnreadableImageError]):
         return f"{len(self)} of {count} images are damaged: left out (the first: {first})"
 
 
-def read_again(read: Callable[[], TrackedFrame]) -> Iterator[TrackedFrame]:
-    """Yield a frame that was delivered before, or nothing if its image can no longer be read."""
-    try:
-        frame = read()
-    except InputError:
-        return
-    yield frame
+def pictures_again(reader: FrameReader, frames: Iterable[tuple[str, Undistorter]]) -> Iterator[tuple[str, Picture]]:
+    """Read images of delivered frames again, as `Tracker.pictures`.
+
+    Args:
+        reader: Reads and undistorts the images.
+        frames: Name and undistorter of each frame.
+    """
+    for name, undistorter in frames:
+        try:
+            picture = reader.read(name, undistorter)
+        except InputError:
+            continue
+        yield name, picture
 
 
 def readable_sizes(images: ImageSource, names: Sequence[str]) -> Iterator[tuple[str, tuple[int, int]]]:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -73,17 +73,9 @@ class StreamDigest:
         if not event.held_out:
             self._take(event.rgba)
 
-    def known(self, again: Iterable[TrackedFrame], frames: DeliveredFrames) -> Iterator[TrackedFrame]:
-        """Yield those of the frames that were delivered before, with the index that they had and the same image.
-
-        Args:
-            again: The frames as they are read now.
-            frames: The frames as they were delivered.
-        """
-        index = dict(zip(frames.name, frames.index, strict=True))
-        for frame in again:
-            if frame.name in index and self._images.get(frame.name) in (None, _checksum(frame)):
-                yield frame if frame.index == index[frame.name] else replace(frame, index=index[frame.name])
+    def has_image_of(self, again: TrackedFrame) -> bool:
+        """Return whether a frame that was read again has the image that it had."""
+        return self._images.get(again.name) in (None, _checksum(again))
 
     def _take(self, *arrays: np.ndarray) -> None:
         for array in arrays:

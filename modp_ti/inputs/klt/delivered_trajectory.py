@@ -87,7 +87,7 @@ class DeliveredTrajectory:
         self._xyz[points.ids[new]] = points.xyz[new]
 
     def forget_points(self) -> None:
-        """Forget the landmarks of all frames. `points` then gives none; poses are still corrected."""
+        """Forget the landmarks of all frames, once the camera is final. Poses are still corrected."""
         for frame in self.frames[self._remembered :]:
             frame.view = replace(frame.view, ids=frame.view.ids[:0].copy(), pixels=frame.view.pixels[:0].copy())
         self._remembered = len(self.frames)

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from functools import partial
 from itertools import chain
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from modp_ti.files.errors import InputError, UnreadableImageError
 from modp_ti.inputs.klt.camera import WHILE_TRACKING, Lens, estimation_note, intrinsics_of
@@ -18,10 +16,9 @@ from modp_ti.inputs.klt.delivered_trajectory import DeliveredFrame, DeliveredTra
 from modp_ti.inputs.klt.odometry import Odometry
 from modp_ti.inputs.klt.selected_images import arriving, available, followed_scale, read_image
 from modp_ti.inputs.klt.tracking import View
-from modp_ti.inputs.live_counts import LiveCounts
-from modp_ti.inputs.protocol import Progress, Tracker
-from modp_ti.inputs.replay import PosedImage, Unreadable, read_again, tracked_frame
-from modp_ti.inputs.sources import FrameReader, Intrinsics, Undistorter
+from modp_ti.inputs.protocol import Event, LiveCounts, Progress, Tracker
+from modp_ti.inputs.replay import PosedImage, Unreadable, pictures_again, tracked_frame
+from modp_ti.inputs.sources import FrameReader, Intrinsics, Picture, Undistorter
 
 __all__ = ["KltTracker"]
 
@@ -31,10 +28,9 @@ BEGINS_ANEW_AFTER = 10  # frames without a pose after which another map may begi
 class KltTracker(Tracker):
     """A `Tracker` that estimates poses and sparse points from the images of `reader`'s source as they arrive.
 
-    `events` can be iterated over once. It delivers frames, and corrections when bundle adjustment has moved earlier
-    ones. The tracker itself can be iterated over repeatedly: it tracks the sequence if that has not been done, and then
-    yields all frames with their final poses. Frames that cannot be localised are skipped and counted in `notes`, which
-    are complete after the last frame. The result depends only on the images, the settings and the seed.
+    It delivers frames when their poses are known, and corrections when bundle adjustment has moved earlier ones. Frames
+    that cannot be localised are skipped and counted in `notes`, which are complete after the last frame. The result
+    depends only on the images, the settings and the seed.
 
     A guessed camera is estimated while frames are delivered, and each estimate comes with a correction. The undistorter
     is always that of the last frame or correction.
@@ -56,6 +52,7 @@ class KltTracker(Tracker):
     """
 
     reads_ahead: ClassVar[bool] = True
+    corrects: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -93,28 +90,22 @@ class KltTracker(Tracker):
         self._trajectory: DeliveredTrajectory | None = None
         self._unreadable = Unreadable()
         self._place, self._further, self._tell = place, further, progress
-        self._ended = False
         self._skipped = 0
         self._progress = self._tracked()
         if place is not None:  # which frames there are is known when all are tracked
             first = next(self._progress, None)
             self._progress = chain(() if first is None else (first,), self._progress)
 
-    def events(self) -> Iterator[TrackedFrame | PoseCorrection]:
-        """Iterate once over frames, when their poses are known, and corrections of earlier ones.
+    def __iter__(self) -> Iterator[Event]:
+        """Iterate once over frames and corrections.
 
         Raises:
             InputError: If too many images are unreadable, their sizes differ, or no frame can be localised.
         """
         return self._progress
 
-    def __iter__(self) -> Iterator[TrackedFrame]:
-        if not self._ended:
-            for _ in self._progress:
-                pass
-        if self._trajectory is not None:
-            for index, delivered in enumerate(self._trajectory.frames):
-                yield from read_again(partial(self._frame, index, delivered, self._trajectory.points(delivered)))
+    def pictures(self, names: Sequence[str]) -> Iterator[tuple[str, Picture]]:
+        return pictures_again(self._reader, ((name, self._delivered) for name in names))
 
     @property
     def notes(self) -> list[str]:
@@ -158,19 +149,10 @@ class KltTracker(Tracker):
     def undistorter(self) -> Undistorter:
         return self._delivered
 
-    def forget_points(self) -> None:
-        """Forget which points the delivered frames see, where the tracker is not iterated over again.
-
-        They are kept as long as the camera may be revised.
-        """
-        tracking = self._odometry.tracking
-        if self._trajectory is not None and tracking is not None and tracking.camera_is_final:
-            self._trajectory.forget_points()
-
     def close(self) -> None:
         self._reader.images.close()
 
-    def _tracked(self) -> Iterator[TrackedFrame | PoseCorrection]:
+    def _tracked(self) -> Iterator[Event]:
         names: list[str] = []
         raw_camera = self.intrinsics.camera
         for number, name in enumerate(arriving(self._reader)):
@@ -191,7 +173,6 @@ class KltTracker(Tracker):
                 f"tracker.maps: {self._place}: klt made {self._odometry.places} maps of {self._reader.images.path}"
             )
         yield from self._delivered_events(names, views, last=True)
-        self._ended = True
         if self._trajectory is not None:
             self._skipped = len(names) - len(self._trajectory.frames)
             yield from self._trajectory.corrections(last=True)
@@ -199,7 +180,7 @@ class KltTracker(Tracker):
 
     def _delivered_events(
         self, names: Sequence[str], views: Sequence[View], raw: NDArray[np.uint8] | None = None, last: bool = False
-    ) -> Iterator[TrackedFrame | PoseCorrection]:
+    ) -> Iterator[Event]:
         """Deliver what has changed and the next views.
 
         Args:
@@ -228,6 +209,8 @@ class KltTracker(Tracker):
             frame = self._frame(index, delivered, points, raw if view.number == len(names) - 1 else None)
             self._trajectory.record(frame.points)
             yield frame
+        if tracking.camera_is_final:
+            self._trajectory.forget_points()
 
     def _take_lens(self, lens: Lens) -> None:
         """Take a new estimate of the camera."""

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from fields.geometry.camera import PinholeCamera
 from modp_ti.files.errors import InputError, UnreadableImageError
 from modp_ti.inputs.sources.masks import LEAST_LIGHT, MaskFolder, differs_from_colour, read_vignette
 from modp_ti.inputs.sources.protocol import ImageSource
@@ -31,11 +32,13 @@ class Picture:
         image: Image (H, W, 3) float32 in [0, 1].
         mask: Valid pixels (H, W), or None if all are valid; as in `TrackedFrame`.
         vignette: Vignette (H, W, 3), or None; as in `TrackedFrame`.
+        camera: Camera of the image.
     """
 
     image: NDArray[np.float32]
     mask: NDArray[np.bool_] | None
     vignette: NDArray[np.float32] | None
+    camera: PinholeCamera
 
 
 class FrameReader:
@@ -107,9 +110,9 @@ class FrameReader:
             )
         image, mask = undistorter.image(raw, self.valid(name, raw))
         if self._vignette is None:
-            return Picture(image, mask, None)
+            return Picture(image, mask, None, undistorter.camera)
         vignette, lit = self._light(undistorter, self._vignette)
-        return Picture(image, both_valid(mask, lit), vignette)
+        return Picture(image, both_valid(mask, lit), vignette, undistorter.camera)
 
     def valid(self, name: str, raw: NDArray[np.uint8]) -> NDArray[np.bool_] | None:
         """Return the valid pixels (H0, W0) of the stored image `raw`, or None if all are valid."""

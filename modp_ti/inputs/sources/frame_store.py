@@ -121,11 +121,10 @@ class StoredFrames(ImageSource):
     Args:
         folder: The folder of a `FrameStore`.
         names: Names of the frames, in order.
-        times: Time of each [s].
     """
 
-    def __init__(self, folder: Path, names: Sequence[str], times: Sequence[float]) -> None:
-        super().__init__(folder, names, times)
+    def __init__(self, folder: Path, names: Sequence[str]) -> None:
+        super().__init__(folder, names, [0.0] * len(names))
         self._store = FrameStore(folder)
 
     def read(self, name: str) -> NDArray[np.uint8]:

@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator, Mapping
-from functools import partial
+from collections.abc import Iterator, Mapping, Sequence
 from queue import Empty, Full, Queue
 from socket import socket
-from threading import Event, Thread
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
+from threading import Event as Flag
+from threading import Thread
 
 import numpy as np
 
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.live_counts import LiveCounts
-from modp_ti.inputs.protocol import Progress, Tracker
-from modp_ti.inputs.replay import PosedImage, points_inside, read_again, tracked_frame
+from modp_ti.inputs.protocol import Event, LiveCounts, Progress, Tracker
+from modp_ti.inputs.replay import PosedImage, pictures_again, points_inside, tracked_frame
+from modp_ti.inputs.sources import Picture
 from modp_ti.inputs.tracker_server.connection import GLANCE, Connection, OthersSpeakError, SenderGoneError
-from modp_ti.inputs.tracker_server.history import History
 from modp_ti.inputs.tracker_server.listening import Lobby, listen, open_to_others
 from modp_ti.inputs.tracker_server.messages import (
     Correction,
@@ -97,6 +96,8 @@ class TrackerServer(Tracker):
         address: Where the server listens, as `host:port` or `unix:path`.
     """
 
+    corrects: ClassVar[bool] = True
+
     def __init__(self, source: SourceSettings, tracker: SocketSettings, progress: Progress | None = None) -> None:
         self._source = source
         self._patience = tracker.patience
@@ -108,15 +109,15 @@ class TrackerServer(Tracker):
             self._notes.append(f"{self.address} is open to the network: whoever reaches it can send frames")
         self._progress = progress
         self._spool: Spool | None = None
-        self._history = History()
+        self._taken = 0  # frames
         self._indices: dict[int, int] = {}  # indices of the delivered frames by the sender's frame numbers
         self._dropped, self._dropped_note = 0, ""
         self._unfit: list[str] = []  # error messages of the skipped messages
         self._waiting: Queue[_Waiting] = Queue(MAX_WAITING)
-        self._events: Queue[TrackedFrame | PoseCorrection | InputError | None] = Queue(max(1, source.prefetch))
+        self._events: Queue[Event | InputError | None] = Queue(max(1, source.prefetch))
         self._newest = 0.0  # arrival of the newest frame
         self._arrived = self._lost = 0
-        self._closed = Event()
+        self._closed = Flag()
         self._ended = False
         self._say_waiting(0)
         # Daemon threads, so that the process can exit without `close`.
@@ -146,10 +147,9 @@ class TrackerServer(Tracker):
     @property
     def live(self) -> LiveCounts:
         tracked = len(self._indices)
-        waiting = tracked - len(self._history.frames)
-        return LiveCounts(self._arrived, tracked, 0, self._lost, max(0, waiting), self._newest)
+        return LiveCounts(self._arrived, tracked, 0, self._lost, max(0, tracked - self._taken), self._newest)
 
-    def events(self) -> Iterator[TrackedFrame | PoseCorrection]:
+    def __iter__(self) -> Iterator[Event]:
         """Iterate once over frames and corrections as they arrive.
 
         Raises:
@@ -163,21 +163,11 @@ class TrackerServer(Tracker):
                 if event is not None:
                     raise event
                 return
-            if isinstance(event, TrackedFrame):
-                undistorter = self._received.undistorter
-                self._history.add(PosedImage(event.name, undistorter, event.T_camera_world, event.points))
-            else:
-                self._history.correct(event)
+            self._taken += isinstance(event, TrackedFrame)
             yield event
 
-    def __iter__(self) -> Iterator[TrackedFrame]:
-        """Iterate over the delivered frames with their corrected poses and points, then over frames that arrive."""
-        for index, frame in enumerate(self._history.frames[:]):
-            points = self._history.placed(self._received.points(frame.name))
-            yield from read_again(partial(tracked_frame, self._received.reader, index, frame.with_points(points)))
-        for event in self.events():
-            if isinstance(event, TrackedFrame):
-                yield event
+    def pictures(self, names: Sequence[str]) -> Iterator[tuple[str, Picture]]:
+        return pictures_again(self._received.reader, ((name, self._received.undistorter) for name in names))
 
     def close(self) -> None:
         """Stop listening, disconnect the sender and delete the temporary files."""
@@ -358,7 +348,7 @@ class TrackerServer(Tracker):
         self._indices[frame.number] = len(self._indices)
         return PosedImage(name, spool.undistorter, pose)
 
-    def _put(self, to: Queue, event: _Waiting | TrackedFrame) -> None:
+    def _put(self, to: Queue, event: _Waiting | Event) -> None:
         while not self._closed.is_set():
             try:
                 to.put(event, timeout=GLANCE)

@@ -86,12 +86,11 @@ class _Child:
             self._connection.send(Opened(tracker.notes, tracker.scale, tracker.intrinsics))
             sender = threading.Thread(target=self._send, args=(tracker.undistorter,), name="sender", daemon=True)
             sender.start()
-            for event in tracker.events():
+            for event in tracker:
                 self._publish()
                 if isinstance(event, PoseCorrection) and event.camera is not None:
                     self._outbox.put(CameraRevised(tracker.intrinsics))
                 self._outbox.put(event)
-                tracker.forget_points()  # the parent has them now
         except InputError as caught:
             error = caught
         except Exception as caught:  # told to the parent, which saves its map

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,9 +39,6 @@ class FrameRecord:
             frame.held_out,
             frame.arrived,
         )
-
-    def with_pose(self, T_camera_world: NDArray[np.float64], points: SparsePoints) -> FrameRecord:
-        return replace(self, T_camera_world=T_camera_world, points=points)
 
     def with_picture(self, picture: Picture) -> TrackedFrame:
         """Return the frame with an image that was read (again)."""

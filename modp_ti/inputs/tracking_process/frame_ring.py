@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from fields.frames.pyramid import ImageLevel
 from fields.frames.tracked_frame import TrackedFrame
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.live_counts import LiveCounts
+from modp_ti.inputs.protocol import LiveCounts
 from modp_ti.inputs.sources import Picture
 from modp_ti.inputs.tracking_process.frame_record import FrameRecord
 
@@ -106,7 +106,7 @@ class FrameRing:
             vignette: Its vignette.
         """
         image, levels, mask = self._arrays(slot)
-        frame = record.with_picture(Picture(image.copy(), mask.copy() if masked else None, vignette))
+        frame = record.with_picture(Picture(image.copy(), mask.copy() if masked else None, vignette, record.camera))
         pyramid, camera = [], frame.camera
         for level in levels:
             height, width = level.shape[:2]

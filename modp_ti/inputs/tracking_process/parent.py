@@ -6,11 +6,11 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping
-from contextlib import suppress
-from functools import partial
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing, suppress
 from multiprocessing import Pipe
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,14 +21,11 @@ from modp_ti.config.settings import SceneConfig
 from modp_ti.files.child_environment import child_environment
 from modp_ti.files.ending_signals import RecordingInterrupt, withheld
 from modp_ti.files.errors import InputError, UnreadableImageError
-from modp_ti.inputs.live_counts import LiveCounts
 from modp_ti.inputs.opening import open_source
-from modp_ti.inputs.protocol import Progress, Tracker
-from modp_ti.inputs.replay import read_again
-from modp_ti.inputs.sources import FrameReader, ImageSource, Undistorter
+from modp_ti.inputs.protocol import Event, LiveCounts, Progress, Tracker
+from modp_ti.inputs.replay import pictures_again
+from modp_ti.inputs.sources import FrameReader, Picture, Undistorter
 from modp_ti.inputs.sources.frame_store import StoredFrames, kept_frames
-from modp_ti.inputs.tracking_process.delivered_log import DeliveredLog
-from modp_ti.inputs.tracking_process.frame_record import FrameRecord
 from modp_ti.inputs.tracking_process.frame_ring import CountsBoard, FrameRing, anonymous_memory
 from modp_ti.inputs.tracking_process.messages import (
     CameraRevised,
@@ -49,29 +46,29 @@ PATIENCE = 2.0
 class TrackingProcess(Tracker):
     """The tracker `klt`, and the capture of its images, in a process of its own, so that mapping does not delay them.
 
-    `events` delivers once what the tracker there delivers. Frames wait there until they are taken, without their images
-    beyond the first few. Iterating over this object yields the frames with their latest poses; it reads their images
-    again in this process, so the other one need not exist any more.
+    It delivers what the tracker there delivers. Frames wait there until they are taken, without their images beyond the
+    first few. `pictures` reads images in this process, so the other one need not exist any more.
 
     Ctrl-C ends the recording, if this object is made in the main thread; a later one, or one after the end of the
     stream, goes to the handler that was there before. If the process dies, the recording ends too, with a note. The
     process ends when this one does.
 
-    The process opens the tracker while this one goes on. `notes`, `scale`, `undistorter` and `events` wait until it has
-    done so, and raise InputError if it cannot.
+    The process opens the tracker while this one goes on. `notes`, `scale`, `undistorter` and the first frame wait until
+    it has done so, and raise InputError if it cannot.
 
     Args:
         config: The scene; the tracker is `klt`.
         progress: Called while the tracker is opened and this process waits for it.
     """
 
+    corrects: ClassVar[bool] = True
+
     def __init__(self, config: SceneConfig, progress: Progress | None = None) -> None:
         self._config = config
         self._slots = max(2, config.source.prefetch)
         self._ring: FrameRing | None = None
         self._vignette: NDArray[np.float32] | None = None
-        self._log = DeliveredLog()
-        self._again: FrameReader | None = None
+        self._taken = 0  # frames
         self._unreadable: Mapping[str, UnreadableImageError] = {}
         self._ended = False
         self._kept = None
@@ -141,9 +138,9 @@ class TrackingProcess(Tracker):
 
     @property
     def live(self) -> LiveCounts | None:
-        return self._board.counts(len(self._log)) if self._config.source.follows_clock else None
+        return self._board.counts(self._taken) if self._config.source.follows_clock else None
 
-    def events(self) -> Iterator[TrackedFrame | PoseCorrection]:
+    def __iter__(self) -> Iterator[Event]:
         """Iterate once over frames and corrections as the tracker delivers them.
 
         Raises:
@@ -156,32 +153,21 @@ class TrackingProcess(Tracker):
                 self._ring = FrameRing(self._memory, message.layout, self._slots)
                 self._vignette = message.vignette
             elif isinstance(message, Delivered):
-                try:
-                    frame = self._delivered(message)
-                except OSError as error:
-                    place = f"{tempfile.gettempdir()}: the points of a frame cannot be kept there: {error.strerror}"
-                    self._board.finish = True
-                    self._end(Ended([], {}, failure=place))
-                    return
-                yield frame
+                yield self._delivered(message)
             elif isinstance(message, CameraRevised):
                 self._undistorter = message.intrinsics.undistorter(self._scale)
             elif isinstance(message, PoseCorrection):
-                self._log.correct(message)
                 yield message
             elif isinstance(message, Ended):
                 self._end(message)
 
-    def __iter__(self) -> Iterator[TrackedFrame]:
-        for _ in self.events():
-            pass
-        if self._again is None:
-            self._again = FrameReader(self._images_again(), self._config.source)
-        for record in self._log:
-            yield from read_again(partial(self._read_again, self._again, record))
-
-    def _read_again(self, reader: FrameReader, record: FrameRecord) -> TrackedFrame:
-        return record.with_picture(reader.read(record.name, self.undistorter))
+    def pictures(self, names: Sequence[str]) -> Iterator[tuple[str, Picture]]:
+        if self._kept is None:
+            images = open_source(self._config.without_clock().source)
+        else:
+            images = StoredFrames(Path(self._kept.name), names)
+        with closing(images):
+            yield from pictures_again(FrameReader(images, self._config.source), ((n, self.undistorter) for n in names))
 
     def close(self) -> None:
         """End the recording and the process, and remove what was stored."""
@@ -195,12 +181,9 @@ class TrackingProcess(Tracker):
             self._process.kill()
             self._process.wait()
         self._interrupt.give_back()
-        if self._again is not None:
-            self._again.images.close()
         if self._memory >= 0:
             os.close(self._memory)
             self._memory = -1
-        self._log.close()
         if self._kept is not None:
             self._kept.cleanup()
 
@@ -223,7 +206,7 @@ class TrackingProcess(Tracker):
     def _delivered(self, message: Delivered) -> TrackedFrame:
         assert self._ring is not None
         frame = self._ring.read(message.slot, message.record, message.masked, self._vignette)
-        self._log.add(message.record)
+        self._taken += 1
         try:
             self._connection.send(message.slot)
         except OSError:
@@ -237,18 +220,10 @@ class TrackingProcess(Tracker):
         if message.error is not None:
             raise message.error
         if message.failure is not None:
-            count = len(self._log)
-            if count == 0:
+            if self._taken == 0:
                 raise InputError(f"{message.failure} before it delivered a frame")
-            frames = "the frame" if count == 1 else f"the {count} frames"
+            frames = "the frame" if self._taken == 1 else f"the {self._taken} frames"
             self._notes.append(f"{message.failure}; the map is finished with {frames} before")
-
-    def _images_again(self) -> ImageSource:
-        """The images of the delivered frames, for this process."""
-        if self._kept is None:
-            return open_source(self._config.without_clock().source)
-        records = self._log.records
-        return StoredFrames(Path(self._kept.name), [r.name for r in records], [r.timestamp for r in records])
 
     def _interrupted(self) -> bool:
         """End the recording after Ctrl-C; return whether it was going on."""

@@ -9,6 +9,7 @@ from dataclasses import replace
 from fields.frames.origin import shifted
 from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from modp_ti.inputs.colmap_model import read_colmap_model
+from modp_ti.inputs.sources import Picture
 from modp_ti.outputs.playback.finished_run import FinishedRun
 from modp_ti.outputs.playback.run_pictures import Preparing, pictures
 
@@ -16,7 +17,7 @@ __all__ = ["FinishedFrames", "frames_of"]
 
 
 class FinishedFrames:
-    """The frames of a finished run in its world, which can be iterated over repeatedly. Images are read one by one.
+    """The frames of a finished run in its world. Images are read one by one.
 
     The ids of the points are negative, so that they never are those of another tracker.
 
@@ -51,6 +52,13 @@ class FinishedFrames:
     def end(self) -> float:
         """Time of the last frame [s]."""
         return float(self._run.timestamps.max())
+
+    def pictures(self, names: Sequence[str]) -> Iterator[tuple[str, Picture]]:
+        """Read images again, see `Tracker.pictures`."""
+        wanted = set(names)
+        places = [place for place, name in enumerate(self._run.names) if name in wanted]
+        for place, picture in zip(places, pictures(self._run, self._preparing, places), strict=True):
+            yield self._run.names[place], picture
 
     def __iter__(self) -> Iterator[TrackedFrame]:
         for frame in frames_of(self._run, range(len(self._run)), self._preparing):

@@ -51,7 +51,7 @@ def pictures(
     """
     folder, wanted = kept_images(run), range(len(run)) if wanted is None else wanted
     if folder is not None:
-        yield from (_kept(folder, run.names[place]) for place in wanted)
+        yield from (_kept(folder, run.names[place], run.cameras[place]) for place in wanted)
         return
     config = run_settings(run)
     if config.is_live or config.source.realtime:
@@ -78,7 +78,7 @@ class _Frames:
     cameras: Sequence[PinholeCamera]
 
 
-def _kept(folder: Path, name: str) -> Picture:
+def _kept(folder: Path, name: str, camera: PinholeCamera) -> Picture:
     file = folder / name
     image = cv2.imread(str(file), cv2.IMREAD_COLOR_RGB) if file.is_file() else None
     if image is None:
@@ -90,7 +90,7 @@ def _kept(folder: Path, name: str) -> Picture:
         if stored is None or stored.shape != image.shape[:2]:
             raise InputError(f"{mask}: not the mask of {name}")
         valid = stored > 0
-    return Picture(np.divide(image, np.float32(255.0), dtype=np.float32), valid, None)
+    return Picture(np.divide(image, np.float32(255.0), dtype=np.float32), valid, None, camera)
 
 
 def _read_again(
@@ -100,27 +100,19 @@ def _read_again(
     stored: Intrinsics | None,
     preparing: Preparing | None,
 ) -> Generator[Picture]:
-    """Read frames from the source: by the camera that the run recorded, or through the tracker if it has several.
-
-    The tracker brings the cameras of the frames; `klt` has to track again for that, but it has one camera.
-    """
+    """Read frames from the source: by the camera that the run recorded, or through the tracker if it has several."""
     scale = config.source.scale
     undistorter = None if stored is None or scale == "auto" else stored.undistorter(scale)
     if undistorter is not None and set(frames.cameras) == {undistorter.camera}:
         yield from _through_source(config, [frames.names[place] for place in wanted], undistorter)
         return
     with closing(open_tracker(config.without_clock(), preparing)) as tracker:
-        count, chosen, known = 0, set(wanted), set(frames.names)
-        # An image that could not be read then, and can be now, was not mapped.
-        again = (frame for frame in tracker if frame.name in known)
-        for frame, name, camera in zip(again, frames.names, frames.cameras, strict=False):
-            if (frame.name, frame.camera) != (name, camera):
+        found = tracker.pictures([frames.names[place] for place in wanted])
+        for place in wanted:
+            name, picture = next(found, (None, None))
+            if picture is None or (name, picture.camera) != (frames.names[place], frames.cameras[place]):
                 raise _changed(config)
-            if count in chosen:
-                yield Picture(frame.image, frame.mask, frame.vignette)
-            count += 1
-    if count < len(frames.names):
-        raise _changed(config)
+            yield picture
 
 
 def _through_source(config: SceneConfig, names: Sequence[str], undistorter: Undistorter) -> Generator[Picture]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,8 +16,8 @@ from modp_ti.engine.interruption import Interruption, RunStopped
 from modp_ti.engine.mapper import Mapper
 from modp_ti.engine.prefetch import FramesAhead
 from modp_ti.engine.realtime import RealtimeRun
-from modp_ti.inputs.live_counts import LiveCounts
-from modp_ti.inputs.protocol import Tracker
+from modp_ti.inputs.protocol import LiveCounts, Tracker
+from modp_ti.inputs.sources import Picture
 from pipelines.settings import DensifySettings, MappingSettings, OptimiseSettings
 from tests.patience import PATIENCE
 from tests.pipelines.wall import frame
@@ -52,10 +52,10 @@ class WallTracker(Tracker):
     def live(self) -> LiveCounts | None:
         return self._counts
 
-    def __iter__(self) -> Iterator[TrackedFrame]:
-        return (event for event in self._events if isinstance(event, TrackedFrame))
+    def pictures(self, names: Sequence[str]) -> Iterator[tuple[str, Picture]]:
+        return iter(())
 
-    def events(self) -> Iterator[TrackedFrame | PoseCorrection]:
+    def __iter__(self) -> Iterator[TrackedFrame | PoseCorrection]:
         return iter(self._events)
 
 
@@ -71,7 +71,7 @@ def new_mapper(realtime: RealtimeRun) -> Mapper:
 def mapped(realtime: RealtimeRun, tracker: Tracker, stop: Interruption | None = None) -> Mapper:
     """Map all that the tracker delivers."""
     mapper = new_mapper(realtime)
-    with FramesAhead(tracker.events(), 0) as ahead:
+    with FramesAhead(tracker, 0) as ahead:
         for event in realtime.events(ahead, mapper, stop or never(), lambda: None):
             if isinstance(event, PoseCorrection):
                 realtime.correct(mapper, event)
@@ -138,7 +138,7 @@ def test_the_map_is_optimised_while_no_frame_waits() -> None:
     enough = threading.Event()
 
     class Slow(WallTracker):
-        def events(self) -> Iterator[TrackedFrame | PoseCorrection]:
+        def __iter__(self) -> Iterator[TrackedFrame | PoseCorrection]:
             yield frame(0)
             assert enough.wait(timeout=PATIENCE)
             yield frame(1)
@@ -153,7 +153,7 @@ def test_the_map_is_optimised_while_no_frame_waits() -> None:
         if len(done) == 3:
             enough.set()
 
-    with FramesAhead(tracker.events(), 1) as ahead:
+    with FramesAhead(tracker, 1) as ahead:
         for event in realtime.events(ahead, mapper, never(), further):
             assert isinstance(event, TrackedFrame)
             realtime.add(mapper, event)
@@ -173,7 +173,7 @@ def test_corrections_behind_each_other_move_the_map_once() -> None:
     tracker = WallTracker([*frames, shifted(0.5), shifted(1.0)])
     realtime = RealtimeRun(SETTINGS, tracker, clock=Clock())
     mapper = new_mapper(realtime)
-    with FramesAhead(tracker.events(), 8) as ahead:
+    with FramesAhead(tracker, 8) as ahead:
         assert ahead._thread is not None
         ahead._thread.join(timeout=PATIENCE)  # all are there
         for event in realtime.events(ahead, mapper, never(), lambda: None):
@@ -189,7 +189,7 @@ def test_the_run_stops_between_two_further_steps() -> None:
     ever = threading.Event()
 
     class Stalled(WallTracker):
-        def events(self) -> Iterator[TrackedFrame | PoseCorrection]:
+        def __iter__(self) -> Iterator[TrackedFrame | PoseCorrection]:
             yield frame(0)
             ever.wait(timeout=PATIENCE)
 
@@ -200,7 +200,7 @@ def test_the_run_stops_between_two_further_steps() -> None:
     def ask() -> None:
         stop.asked = True
 
-    with FramesAhead(tracker.events(), 1) as ahead:
+    with FramesAhead(tracker, 1) as ahead:
         with pytest.raises(RunStopped):
             for event in realtime.events(ahead, mapper, stop, ask):
                 assert isinstance(event, TrackedFrame)

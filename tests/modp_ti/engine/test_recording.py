@@ -78,7 +78,7 @@ def test_frames_and_corrections_are_read_as_they_were(tmp_path: Path) -> None:
     )
     correction = PoseCorrection(np.arange(1), np.eye(4)[None], np.array([7]), np.array([[1.0, 2.0, 3.0]]))
     session = recorded(tmp_path, [first, second, correction])
-    a, b, c = session.events()
+    a, b, c = session
     for read, written in ((a, first), (b, second)):
         assert isinstance(read, TrackedFrame)
         np.testing.assert_array_equal(read.rgba, written.rgba)
@@ -93,7 +93,9 @@ def test_frames_and_corrections_are_read_as_they_were(tmp_path: Path) -> None:
     assert isinstance(c, PoseCorrection) and c.xyz.tolist() == [[1.0, 2.0, 3.0]] and c.ids.tolist() == [7]
     assert session.plans == [Plan(0.5, 3), None] and session.shares == [0.0, 0.5]
     assert session.further == [1, 1, 1, 0] and session.more == [False] and session.frame_count == 2
-    assert [read.index for read in session] == [0, 1]
+    again = list(session.pictures([second.name, "gone"]))
+    assert [name for name, _ in again] == [second.name]
+    np.testing.assert_array_equal(again[0][1].image, b.image)
 
 
 def test_a_folder_without_a_session_says_how_to_record_one(tmp_path: Path) -> None:

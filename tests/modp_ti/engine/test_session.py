@@ -261,6 +261,9 @@ class LiveTracker(Tracker):
             yield TrackedFrame(i, i / 30, str(i), np.zeros((48, 64, 3), np.float32), camera, np.eye(4))
         self.said.append("said last")
 
+    def pictures(self, names):
+        return iter(())
+
     def close(self):
         self.closed = True
 

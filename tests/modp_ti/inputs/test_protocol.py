@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import pytest
@@ -11,6 +11,8 @@ from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from modp_ti.commands.check import _lens
 from modp_ti.inputs.protocol import Tracker
+from modp_ti.inputs.delivered_frames import settled
+from modp_ti.inputs.sources import Picture
 
 
 class Plain(Tracker):
@@ -20,6 +22,9 @@ class Plain(Tracker):
     def notes(self) -> list[str]:
         return []
 
+    def pictures(self, names: Sequence[str]) -> Iterator[tuple[str, Picture]]:
+        return iter(())
+
     def __iter__(self) -> Iterator[TrackedFrame]:
         camera = PinholeCamera(10.0, 10.0, 4.0, 4.0, 8, 8)
         for i in range(2):
@@ -28,7 +33,8 @@ class Plain(Tracker):
 
 def test_what_few_trackers_can_do_has_a_default():
     tracker = Plain()
-    assert [frame.name for frame in tracker.events()] == [frame.name for frame in tracker] == ["0", "1"]
+    assert [frame.name for frame in tracker] == ["0", "1"]
+    assert [frame.index for frame in settled(tracker)] == [0, 1]
     assert not tracker.reads_ahead
     assert tracker.frame_count is None and tracker.undistorter is None
     assert not tracker.unreadable

@@ -15,6 +15,7 @@ from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
 from modp_ti.config.settings import IntrinsicsSettings, SourceSettings
 from modp_ti.files.errors import InputError
+from modp_ti.inputs.delivered_frames import settled
 from modp_ti.inputs.klt import KltTracker, open_klt
 from modp_ti.inputs.klt.opening import estimated_intrinsics
 from modp_ti.inputs.readers.klt import KltSettings
@@ -34,14 +35,14 @@ def known_camera(folder: Path, box_room, **settings) -> KltTracker:
 
 @pytest.fixture(scope="module")
 def delivered(box_room, box_walk, tmp_path_factory):
-    """The walk at half its size: the tracker, what its events were, and the frames that it gives afterwards."""
+    """The walk at half its size: the tracker, and what it delivered."""
     folder = box_walk.written(tmp_path_factory.mktemp("walk") / "images")
     tracker = known_camera(folder, box_room, scale=0.5, holdout=8)
-    return tracker, list(tracker.events()), list(tracker)
+    return tracker, list(tracker)
 
 
 def test_frames_keep_the_contract_of_a_tracker(delivered, box_room, box_walk):
-    tracker, events, _ = delivered
+    tracker, events = delivered
     frames = [event for event in events if isinstance(event, TrackedFrame)]
     assert tracker.frame_count == len(frames)
     assert [frame.index for frame in frames] == list(range(60))
@@ -66,8 +67,8 @@ def test_frames_keep_the_contract_of_a_tracker(delivered, box_room, box_walk):
     assert np.median(np.linalg.norm(places[0] - places[1], axis=1)) < 0.02
 
 
-def test_corrections_lead_from_the_delivered_poses_to_the_last_ones(delivered, box_walk):
-    _, events, last = delivered
+def test_corrections_lead_from_the_delivered_poses_to_the_last_ones(delivered, box_room, box_walk, tmp_path):
+    _, events = delivered
     poses: dict[int, np.ndarray] = {}
     corrections = 0
     for event in events:
@@ -78,8 +79,15 @@ def test_corrections_lead_from_the_delivered_poses_to_the_last_ones(delivered, b
         else:
             poses[event.index] = event.T_camera_world
     assert corrections >= 1
-    for frame in last:
+    again = known_camera(box_walk.written(tmp_path / "images"), box_room, scale=0.5, holdout=8)
+    first = {event.index: event for event in events if isinstance(event, TrackedFrame)}
+    for frame in settled(again):
         np.testing.assert_array_equal(frame.T_camera_world, poses[frame.index])
+        np.testing.assert_array_equal(frame.image, first[frame.index].image)
+        np.testing.assert_array_equal(frame.points.ids, first[frame.index].points.ids)
+        p = frame.points.xyz @ frame.T_camera_world[:3, :3].T + frame.T_camera_world[:3, 3]
+        error = np.linalg.norm(frame.camera.project(p) - frame.points.pixels, axis=1)
+        assert np.median(error) < 0.3
     assert absolute_trajectory_error([poses[i] for i in range(60)], box_walk.poses) < 0.01
 
 
@@ -96,7 +104,8 @@ def test_images_that_exif_turns_are_tracked_like_upright_ones(box_room, box_walk
         cv2.imwrite(str(tmp_path / "upright" / f"{i:04d}.png"), cv2.rotate(stored, cv2.ROTATE_90_CLOCKWISE))
     intrinsics = IntrinsicsSettings(fx=camera.fx, fy=camera.fy, cx=camera.cx, cy=camera.cy)
     stored, upright = (
-        list(open_klt(SourceSettings(path=tmp_path / name, intrinsics=intrinsics))) for name in ("stored", "upright")
+        list(settled(open_klt(SourceSettings(path=tmp_path / name, intrinsics=intrinsics))))
+        for name in ("stored", "upright")
     )
     assert len(stored) == len(upright) == 30
     for a, b in zip(stored, upright, strict=True):
@@ -106,34 +115,13 @@ def test_images_that_exif_turns_are_tracked_like_upright_ones(box_room, box_walk
         np.testing.assert_array_equal(a.points.pixels, b.points.pixels)
 
 
-def test_iterating_alone_tracks_too_and_gives_the_same(delivered, box_room, box_walk, tmp_path):
-    frames = list(known_camera(box_walk.written(tmp_path / "images"), box_room, scale=0.5, holdout=8))
-    _, _, last = delivered
-    for one, other in zip(frames, last, strict=True):
-        np.testing.assert_array_equal(one.T_camera_world, other.T_camera_world)
-        np.testing.assert_array_equal(one.points.xyz, other.points.xyz)
-
-
-def test_points_of_delivered_frames_may_be_forgotten(delivered, box_room, box_walk, tmp_path):
-    _, expected, last = delivered
-    tracker = known_camera(box_walk.written(tmp_path / "images"), box_room, scale=0.5, holdout=8)
-    for one, other in zip(tracker.events(), expected, strict=True):
-        np.testing.assert_array_equal(one.T_camera_world, other.T_camera_world)
-        if isinstance(one, TrackedFrame):
-            np.testing.assert_array_equal(one.points.xyz, other.points.xyz)
-            tracker.forget_points()
-    for one, other in zip(tracker, last, strict=True):
-        np.testing.assert_array_equal(one.T_camera_world, other.T_camera_world)
-        assert len(one.points) == 0
-
-
 def test_the_number_of_frames_is_known_from_the_start_and_shrinks_by_those_without_a_pose(box_room, box_walk, tmp_path):
     folder = box_walk.written(tmp_path / "images")
     for i in range(35, 38):
         cv2.imwrite(str(folder / f"{i:04d}.png"), np.zeros((240, 320, 3), np.uint8))
     tracker = known_camera(folder, box_room, stop=45)
     assert tracker.frame_count == 45
-    expected = [tracker.frame_count for event in tracker.events() if isinstance(event, TrackedFrame)]
+    expected = [tracker.frame_count for event in tracker if isinstance(event, TrackedFrame)]
     assert expected[:30] == [45] * 30
     assert len(expected) == tracker.frame_count == expected[-1] < 45
 
@@ -146,7 +134,7 @@ def test_no_point_is_delivered_where_the_mask_is_black(box_room, box_walk, tmp_p
     mask[:, 200:] = 0
     for i in range(60):
         cv2.imwrite(str(masks / f"{i:04d}.png"), mask)
-    frames = list(known_camera(folder, box_room, stop=40, masks=masks))
+    frames = [e for e in known_camera(folder, box_room, stop=40, masks=masks) if isinstance(e, TrackedFrame)]
     assert len(frames) == 40
     assert all((frame.points.pixels[:, 0] < 200).all() for frame in frames)
     assert min(len(frame.points) for frame in frames) > 30
@@ -174,7 +162,7 @@ def test_images_that_do_not_tell_the_camera_give_a_guess_and_a_map_of_nothing_is
     tracker = open_klt(SourceSettings(path=folder))
     assert "is a guess" in tracker.notes[0]
     with pytest.raises(InputError, match="could place none of the 4 images"):
-        list(tracker.events())
+        list(tracker)
 
 
 def test_images_of_two_sizes_are_refused_before_tracking(tmp_path):
@@ -189,7 +177,7 @@ def test_desk_is_tracked_from_its_images_alone(shared_data):
     import pycolmap
 
     data = shared_data("desk")
-    frames = list(open_klt(SourceSettings(path=data / "images", scale=0.25)))
+    frames = list(settled(open_klt(SourceSettings(path=data / "images", scale=0.25))))
     model = pycolmap.Reconstruction(str(data / "sparse" / "0"))
     truth = {image.name: np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]) for image in model.images.values()}
     assert len(frames) >= 27
@@ -205,7 +193,7 @@ def test_frames_of_a_guessed_camera_are_delivered_at_once_and_corrected_when_it_
     images.scale = 0.5
     guess = Intrinsics(replace(box_room.camera, fx=1.12 * box_room.camera.fx, fy=1.12 * box_room.camera.fy))
     tracker = KltTracker(FrameReader(images, source), guess, is_guess=True)
-    events = list(tracker.events())
+    events = list(tracker)
     revisions = [n for n, event in enumerate(events) if isinstance(event, PoseCorrection) and event.camera is not None]
     first = revisions[0]
     assert isinstance(events[0], TrackedFrame) and events[0].camera.fx == pytest.approx(guess.camera.fx / 2)
@@ -216,7 +204,8 @@ def test_frames_of_a_guessed_camera_are_delivered_at_once_and_corrected_when_it_
     frames = [event for event in events if isinstance(event, TrackedFrame)]
     assert len(frames) == 60 and frames[-1].camera.fx == pytest.approx(found / 2)
     assert "estimated from" in tracker.notes[-1]
-    for one in tracker:
+    again = KltTracker(FrameReader(images, source), guess, is_guess=True)
+    for one in settled(again):
         assert one.camera == frames[-1].camera
         p = one.points.xyz @ one.T_camera_world[:3, :3].T + one.T_camera_world[:3, 3]
         error = np.linalg.norm(one.camera.project(p) - one.points.pixels, axis=1)
@@ -229,13 +218,13 @@ def test_frames_of_a_second_map_come_with_their_own_images_when_it_is_joined(box
     images = [*box_walk.images[:30], *[black] * 12, *there]
     folder = Walk([], images).written(tmp_path / "images")
     tracker = known_camera(folder, box_room)
-    frames = [event for event in tracker.events() if isinstance(event, TrackedFrame)]
+    frames = list(settled(tracker))
     assert [int(frame.name[:4]) for frame in frames] == [*range(30), *range(42, 102)]
     assert tracker.frame_count == 90
     for frame in frames[::10]:
         np.testing.assert_allclose(frame.image, images[int(frame.name[:4])] / 255, atol=1e-3)
     truth = [*box_walk.poses[:30], *turning_walk(60)]
-    assert absolute_trajectory_error([frame.T_camera_world for frame in tracker], truth) < 0.02
+    assert absolute_trajectory_error([frame.T_camera_world for frame in frames], truth) < 0.02
     assert any("1 maps begun anew were joined" in note for note in tracker.notes)
 
 
@@ -243,7 +232,7 @@ def test_a_map_that_is_not_joined_is_named_in_a_note(box_room, box_walk, tmp_pat
     black = np.zeros((240, 320, 3), np.uint8)
     images = [*box_walk.images[:20], *[black] * 12, *(image[::-1] for image in box_walk.images[:15])]
     tracker = known_camera(Walk([], images).written(tmp_path / "images"), box_room)
-    assert [frame.name for frame in tracker] == [f"{i:04d}.png" for i in range(20)]
+    assert [event.name for event in tracker if isinstance(event, TrackedFrame)] == [f"{i:04d}.png" for i in range(20)]
     note = next(note for note in tracker.notes if "other maps" in note)
     assert "15 of these images are in 1 other maps" in note and "0032.png to 0046.png" in note
 
@@ -282,7 +271,7 @@ def test_the_frames_of_the_wanted_map_are_delivered_and_the_others_told(two_plac
     tracker = open_klt(two_places, KltSettings(maps=maps), progress=lambda what, *_: told.append(what))
     if maps != "first":
         assert tracker.frame_count == len(numbers) and set(told) == {"tracking"}
-    frames = [event for event in tracker.events() if isinstance(event, TrackedFrame)]
+    frames = [event for event in tracker if isinstance(event, TrackedFrame)]
     assert [frame.name for frame in frames] == [f"{number:04d}.png" for number in numbers]
     assert [frame.index for frame in frames] == list(range(len(frames)))
     assert all(len(frame.points) > 60 for frame in frames)

@@ -303,7 +303,7 @@ def test_a_tracker_without_a_map_says_that_the_disk_was_full(camera, opened, mon
     camera.send(*range(6))
     source = opened(time.monotonic)
     tracker = open_klt(SourceSettings(stream=camera.url), images=source)
-    arriving = tracker.events()
+    arriving = iter(tracker)
     monkeypatch.setattr("modp_ti.inputs.sources.frame_store.has_room", lambda *_: len(source.names) < 3)
     with pytest.raises(
         InputError, match=r"none of the 3 images before the recording ended \(.*less than 1 GiB is free"

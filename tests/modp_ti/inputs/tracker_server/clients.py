@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import socket
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -13,6 +13,7 @@ import numpy as np
 from fields.frames.tracked_frame import TrackedFrame
 from modp_ti.config.settings import SourceSettings
 from modp_ti.inputs.readers.socket import SocketSettings
+from modp_ti.inputs.protocol import Event
 from modp_ti.inputs.tracker_server import TrackerServer, open_tracker_server
 from tests.patience import PATIENCE
 
@@ -109,6 +110,6 @@ def greeted(path: Path) -> socket.socket:
     return connection
 
 
-def colours(frames: list[TrackedFrame]) -> list[int]:
+def colours(events: Iterable[Event]) -> list[int]:
     """The numbers that the frames were sent with."""
-    return [int(f.rgba[0, 0, 0]) for f in frames]
+    return [int(event.rgba[0, 0, 0]) for event in events if isinstance(event, TrackedFrame)]

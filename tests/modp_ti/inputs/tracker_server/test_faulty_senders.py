@@ -133,7 +133,6 @@ def test_a_malformed_message_ends_the_stream_and_the_run_has_what_came_before(ca
         assert colours(list(tracker)) == [1, 2]
         assert said in tracker.notes[-1]
         assert tracker.notes[-1].startswith("the stream ended early: ")
-        assert colours(list(tracker)) == [1, 2]  # again
         with pytest.raises(OSError):
             connect(tmp_path / "s")  # nobody else takes over
 
@@ -158,7 +157,7 @@ def test_a_pose_of_no_use_that_comes_later_loses_its_frame_alone(tmp_path: Path)
         connection.sendall(message(CORRECTION, correction({2: pose(), 3: pose(7.0)}, {})) + message(POSE, late(2)))
         connection.sendall(message(CORRECTION, correction({2: pose()}, {})) + message(END))
         assert answer(connection) == (DONE, struct.pack("<I", 2))
-        events = list(tracker.events())
+        events = list(tracker)
         assert colours([event for event in events if isinstance(event, TrackedFrame)]) == [1, 3]
         (correction_of_3,) = [event for event in events if isinstance(event, PoseCorrection)]
         assert correction_of_3.index.tolist() == [1]

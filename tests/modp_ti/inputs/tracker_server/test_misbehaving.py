@@ -20,6 +20,7 @@ from tests.modp_ti.inputs.tracker_server.clients import (
     HELLO,
     WELCOME,
     answer,
+    colours,
     connect,
     frame,
     hello,
@@ -49,7 +50,7 @@ def served(tracker, path: Path) -> list[int]:
         frames = list(tracker)
         assert answer(connection)[0] == WELCOME
         assert answer(connection)[0] == DONE
-    return [int(f.rgba[0, 0, 0]) for f in frames]
+    return colours(frames)
 
 
 def test_bad_starts_are_counted_in_one_note_and_the_next_tracker_is_served(tmp_path: Path) -> None:
@@ -89,7 +90,7 @@ def test_a_tracker_that_needs_long_for_its_first_frame_is_served_after_others_sp
         assert answer(slow)[0] == WELCOME
         assert peer(tmp_path / "s", "bad starts").wait(timeout=PATIENCE) == 0
         slow.sendall(message(FRAME, frame(1)) + message(FRAME, frame(2)) + message(END))
-        assert [int(f.rgba[0, 0, 0]) for f in tracker] == [1, 2]
+        assert colours(tracker) == [1, 2]
         assert answer(slow)[0] == DONE
 
 
@@ -122,7 +123,7 @@ def test_a_flood_ends_the_stream_with_what_came_before(how: str, said: str, tmp_
         frames = list(tracker)
         told, _ = flooding.communicate("", timeout=PATIENCE)
         assert len(os.listdir(tracker._spool.path)) < 60
-    assert [int(f.rgba[0, 0, 0]) for f in frames] == [1]
+    assert colours(frames) == [1]
     assert said in told
     assert any(said in note for note in tracker.notes)
 

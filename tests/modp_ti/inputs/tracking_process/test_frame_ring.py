@@ -9,7 +9,7 @@ import pytest
 
 from fields.frames.tracked_frame import TrackedFrame
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.live_counts import LiveCounts
+from modp_ti.inputs.protocol import LiveCounts
 from modp_ti.inputs.tracking_process.frame_record import FrameRecord
 from modp_ti.inputs.tracking_process.frame_ring import CountsBoard, FrameRing, SlotLayout, anonymous_memory
 from tests.modp_ti.inputs.tracking_process.frames import assert_same, random_frame

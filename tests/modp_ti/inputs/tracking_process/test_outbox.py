@@ -29,7 +29,7 @@ def test_order_is_kept_and_only_the_first_frames_keep_their_images():
     got = [outbox.get() for _ in range(5)]
     assert got[0] is frames[1] and got[2] is correction and got[3] is frames[3]
     assert isinstance(got[1], FrameRecord) and isinstance(got[4], FrameRecord)
-    assert_same(got[1].with_picture(Picture(frames[2].image, None, None)), frames[2])
+    assert_same(got[1].with_picture(Picture(frames[2].image, None, None, frames[2].camera)), frames[2])
 
 
 def test_the_tracker_waits_only_at_the_limit(monkeypatch):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import signal
 import subprocess
@@ -77,7 +76,7 @@ def test_it_delivers_what_the_tracker_delivers_in_this_process(scene, started, t
     # Dark parts of the images are masked.
     config = scene(masks=box_walk.written(tmp_path / "masks")) if masked else scene()
     here, there = open_klt(config.source, seed=config.seed), started(config)
-    expected, got = list(here.events()), list(there.events())
+    expected, got = list(here), list(there)
     assert masked or sum(isinstance(event, PoseCorrection) for event in expected) > 0
     for one, other in zip(got, expected, strict=True):
         if isinstance(one, TrackedFrame):
@@ -89,12 +88,11 @@ def test_it_delivers_what_the_tracker_delivers_in_this_process(scene, started, t
     assert (there.scale, there.frame_count) == (here.scale, here.frame_count)
     assert there.live is None and "the tracker has a process of its own with one core" in there.notes[-1]
     there._process.wait(PATIENCE)  # what comes now does not need it
-    for _ in range(2):
-        for one, other in zip(there, here, strict=True):
-            assert one.name == other.name and one.held_out == other.held_out
-            np.testing.assert_array_equal(one.image, other.image)
-            np.testing.assert_array_equal(one.T_camera_world, other.T_camera_world)
-    assert list(there.events()) == []
+    names = [event.name for event in expected if isinstance(event, TrackedFrame)]
+    for (name, one), (same, other) in zip(there.pictures(names), here.pictures(names), strict=True):
+        assert name == same and one.camera == other.camera
+        np.testing.assert_array_equal(one.image, other.image)
+    assert list(there) == []
 
 
 def test_a_mapper_that_takes_nothing_does_not_hold_up_the_tracker(scene, started):
@@ -104,7 +102,7 @@ def test_a_mapper_that_takes_nothing_does_not_hold_up_the_tracker(scene, started
     began = time.monotonic()
     wait_until(lambda: tracker.live.arrived == 60 and tracker.live.waiting + tracker.live.thinned == 60)
     assert time.monotonic() - began > 1.5, "at the pace of the images"
-    frames = [event for event in tracker.events() if isinstance(event, TrackedFrame)]
+    frames = [event for event in tracker if isinstance(event, TrackedFrame)]
     counts = tracker.live
     assert (counts.waiting, counts.tracked, counts.lost) == (0, len(frames), 0)
     arrived = [frame.arrived for frame in frames]
@@ -118,13 +116,14 @@ def test_a_mapper_that_takes_nothing_does_not_hold_up_the_tracker(scene, started
 
 def test_a_process_that_is_killed_ends_the_recording_with_a_note(scene, started):
     tracker = started(scene(realtime=True, fps=20))
-    events = tracker.events()
+    events = iter(tracker)
     frames = [event for event in (next(events) for _ in range(5)) if isinstance(event, TrackedFrame)]
     os.kill(tracker._process.pid, signal.SIGKILL)
     frames += [event for event in events if isinstance(event, TrackedFrame)]
     said = f"the tracker process ended (signal 9); the map is finished with the {len(frames)} frames before"
     assert tracker.notes[-1] == said
-    assert [frame.name for frame in tracker] == [frame.name for frame in frames]
+    names = [frame.name for frame in frames]
+    assert [name for name, _ in tracker.pictures(names)] == names
 
 
 def test_a_process_that_is_killed_before_its_first_frame_is_an_error(scene, started):
@@ -132,12 +131,12 @@ def test_a_process_that_is_killed_before_its_first_frame_is_an_error(scene, star
     assert tracker.scale == 0.5  # it is open
     os.kill(tracker._process.pid, signal.SIGKILL)
     with pytest.raises(InputError, match=r"^the tracker process ended \(signal 9\) before it delivered a frame$"):
-        list(tracker.events())
+        list(tracker)
 
 
 def test_ctrl_c_ends_the_recording_and_a_second_one_interrupts(scene, started):
     tracker = started(scene(realtime=True, fps=20))
-    events = tracker.events()
+    events = iter(tracker)
     taken = [next(events) for _ in range(3)]
     os.kill(tracker._process.pid, signal.SIGINT)  # as from the terminal, to the whole group
     os.kill(os.getpid(), signal.SIGINT)
@@ -154,7 +153,7 @@ def test_ctrl_c_after_the_end_of_the_stream_goes_to_the_run_though_frames_wait(s
     before = signal.signal(signal.SIGINT, lambda *_: pressed.append(True))
     try:
         tracker = started(scene(realtime=True, fps=20))
-        events = tracker.events()
+        events = iter(tracker)
         taken = [next(events)]
         wait_until(lambda: tracker.live.arrived == 60 and not tracker._board.recording)
         os.kill(os.getpid(), signal.SIGINT)
@@ -166,32 +165,16 @@ def test_ctrl_c_after_the_end_of_the_stream_goes_to_the_run_though_frames_wait(s
         signal.signal(signal.SIGINT, before)
 
 
-def test_a_full_disk_ends_the_recording_with_a_note(scene, started, monkeypatch):
-    tracker = started(scene(realtime=True, fps=20))
-    events = tracker.events()
-    frames = [event for event in (next(events) for _ in range(5)) if isinstance(event, TrackedFrame)]
-
-    def full(*_):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(tracker._log, "add", full)
-    frames += [event for event in events if isinstance(event, TrackedFrame)]
-    assert tracker.notes[-1].endswith(
-        f"No space left on device; the map is finished with the {len(frames)} frames before"
-    )
-    assert [frame.name for frame in tracker] == [frame.name for frame in frames]
-
-
 def test_input_errors_are_those_of_the_tracker(scene, started, tmp_path, folder):
     with pytest.raises(InputError, match="no such folder of images"):
-        list(started(scene(path=tmp_path / "nothing")).events())
+        list(started(scene(path=tmp_path / "nothing")))
     dark = tmp_path / "dark"
     dark.mkdir()
     for i in range(3):
         (dark / f"{i}.png").write_bytes(encoded(np.zeros((120, 160, 3), np.uint8)))
     tracker = started(scene(path=dark, intrinsics={"fx": 100.0}))
     with pytest.raises(InputError, match="klt could place none of the 3 images"):
-        list(tracker.events())
+        list(tracker)
 
 
 @pytest.fixture
@@ -216,7 +199,7 @@ def test_a_stream_that_stalls_goes_on_and_its_frames_can_be_read_again(scene, st
     threading.Thread(target=film, daemon=True).start()
     tracker = started(scene(stream=camera.url))
     kept = Path(tracker._kept.name)
-    events = tracker.events()
+    events = iter(tracker)
     frames = [next(events) for _ in range(5)]
     wait_until(lambda: tracker.live.arrived == 30)
     time.sleep(0.5)
@@ -227,7 +210,7 @@ def test_a_stream_that_stalls_goes_on_and_its_frames_can_be_read_again(scene, st
     assert tracker.live.tracked == len(frames) > 10
     assert tracker.live.tracked + tracker.live.thinned + tracker.live.lost == tracker.live.arrived == 60
     tracker._process.wait(PATIENCE)
-    for one, other in zip(tracker, frames, strict=True):
+    for (_, one), other in zip(tracker.pictures([frame.name for frame in frames]), frames, strict=True):
         np.testing.assert_array_equal(one.image, other.image)
     tracker.close()
     assert not kept.exists()
@@ -240,7 +223,7 @@ def test_what_was_recorded_stays_when_the_parent_is_killed(camera, box_walk, tmp
         "from modp_ti.inputs.tracking_process import TrackingProcess\n"
         "source = {'stream': sys.argv[1], 'intrinsics': {'fx': 270.0}}\n"
         "tracker = TrackingProcess(SceneConfig(source=source, tracker={'kind': 'klt'}, output='out'))\n"
-        "next(tracker.events())\n"
+        "next(iter(tracker))\n"
         "print(tracker._process.pid, flush=True)\n"
         "input()\n"
     )
