@@ -172,7 +172,10 @@ class Spool(ImageSource):
 
     def _decode(self, name: str) -> NDArray[np.uint8]:
         width, height = self.frame_size
-        data = (self.path / name).read_bytes()
+        try:
+            data = (self.path / name).read_bytes()
+        except OSError as error:
+            raise InputError(f"{self.path / name}: the frame that was kept there is gone: {error.strerror}") from None
         if self._encoding.channels is not None:
             image = np.frombuffer(data, np.uint8).reshape(height, width, self._encoding.channels)
             return np.repeat(image, 3, axis=2) if image.shape[2] == 1 else image
