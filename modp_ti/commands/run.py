@@ -170,7 +170,7 @@ def _run(
     if tasks is not None:
         raise InputError("--engine and --address are for --parts, whose tasks they carry out")
     from modp_ti.engine.session import run_scene
-    from modp_ti.engine.snapshots.recovery import discard
+    from modp_ti.engine.snapshots import discard
 
     folder = run_scene(config, progress_console(quiet), snapshot)
     if resume is not None:

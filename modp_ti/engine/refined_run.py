@@ -17,7 +17,7 @@ from fields.runtime.backend import describe, initialise
 from modp_ti.config.settings import SceneConfig
 from modp_ti.engine.build import build_mapper
 from modp_ti.engine.results import Results, summary_of
-from modp_ti.engine.snapshots.file import FILE
+from modp_ti.engine.snapshots import FILE
 from modp_ti.files import read_json
 from modp_ti.files.errors import InputError
 from modp_ti.files.run_folder import require_usable

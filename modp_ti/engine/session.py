@@ -28,9 +28,7 @@ from modp_ti.engine.recording import RecordedSession
 from modp_ti.engine.remarks import remarks
 from modp_ti.engine.results import Results, metrics_of
 from modp_ti.engine.run_clock import RunClock, peak_memory_mb
-from modp_ti.engine.snapshots import Checkpointer, Snapshot, replay
-from modp_ti.engine.snapshots.file import FILE
-from modp_ti.engine.snapshots.recovery import Recovery
+from modp_ti.engine.snapshots import FILE, Checkpointer, Recovery, Snapshot, replay
 from modp_ti.engine.unfinished import Unfinished
 from modp_ti.files.errors import InputError
 from modp_ti.files.run_folder import run_folder

@@ -126,29 +126,14 @@ class TrackedPoints:
         Args:
             state: The arrays.
             held_out: Whether each frame is held out.
-
-        Raises:
-            KeyError: If an array is missing.
-            ValueError: If an array has the wrong shape or contains invalid indices.
         """
-        count, frames = len(state["ids"]), len(held_out)
-        shapes = {"ids": (count,), "xyz": (count, 3), "colours": (count, 4), "last": (count, 1), "counts": (frames,)}
-        seen = int(state["counts"].sum())
-        for name, shape in (shapes | {"rows": (seen,), "pixels": (seen, 2)}).items():
-            if state[name].shape != shape:
-                raise ValueError(f"{name} of the points has shape {state[name].shape}, expected {shape}")
-        for name, limit in (("rows", count), ("last", frames)):
-            if ((state[name] < 0) | (state[name] >= limit)).any():
-                raise ValueError(f"{name} of the points names some that there are not")
-        cuts = np.cumsum(state["counts"])[:-1] if frames else []
-        self.rows = np.split(state["rows"], cuts) if frames else []
-        self.pixels = np.split(state["pixels"], cuts) if frames else []
+        cuts = np.cumsum(state["counts"])[:-1]
+        self.rows = np.split(state["rows"], cuts) if held_out else []
+        self.pixels = np.split(state["pixels"], cuts) if held_out else []
         self._held_out = list(held_out)
-        self._observations = seen
+        self._observations = len(state["rows"])
         self._row_of = RowsOfIds(state["ids"])
-        self._xyz = state["xyz"]
-        # Earlier snapshots hold these as larger numbers.
-        self._colours, self._last = state["colours"].astype(np.uint32), state["last"].astype(np.int32)
+        self._xyz, self._colours, self._last = state["xyz"], state["colours"], state["last"]
 
     def _grow(self, count: int) -> None:
         if count <= len(self._xyz):

@@ -190,8 +190,7 @@ def carry_out(console: Any) -> Path:
 
 def _begun(config: SceneConfig, console: Any) -> tuple[SceneConfig, Any, Any]:
     """Return settings, console and snapshot for `run_scene`; None for a snapshot if there is none that fits."""
-    from modp_ti.engine.snapshots import Snapshot, continued
-    from modp_ti.engine.snapshots.file import FILE
+    from modp_ti.engine.snapshots import FILE, Snapshot, continued
 
     file = config.output / FILE
     if file.is_file():

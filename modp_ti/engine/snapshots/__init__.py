@@ -3,7 +3,17 @@
 from __future__ import annotations
 
 from modp_ti.engine.snapshots.checkpointer import Checkpointer
-from modp_ti.engine.snapshots.resume import continued, fetch_snapshot, load_resumed, replay
-from modp_ti.engine.snapshots.snapshot import Snapshot
+from modp_ti.engine.snapshots.resume import Recovery, continued, discard, fetch_snapshot, load_resumed, replay
+from modp_ti.engine.snapshots.snapshot import FILE, Snapshot
 
-__all__ = ["Checkpointer", "Snapshot", "continued", "fetch_snapshot", "load_resumed", "replay"]
+__all__ = [
+    "FILE",
+    "Checkpointer",
+    "Recovery",
+    "Snapshot",
+    "continued",
+    "discard",
+    "fetch_snapshot",
+    "load_resumed",
+    "replay",
+]

@@ -1,4 +1,4 @@
-"""Resuming a run: find its snapshot and settings, and read again the frames that the snapshot was made from."""
+"""Resuming a run: from its snapshot, or from the frames that a killed live run has kept."""
 
 from __future__ import annotations
 
@@ -7,20 +7,25 @@ import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
 from modp_ti.config.keys import as_yaml, differing_keys, leaves
-from modp_ti.config.scene_file import load_scene, scene_from_data
+from modp_ti.config.scene_file import dump_scene, load_scene, scene_from_data
 from modp_ti.config.settings import SceneConfig
+from modp_ti.inputs.readers.socket import SocketSettings
 from modp_ti.engine.mapper import Mapper
-from modp_ti.engine.snapshots.file import FILE, of_another_program
-from modp_ti.engine.snapshots.recovery import recovered
-from modp_ti.engine.snapshots.snapshot import Snapshot, StreamDigest
+from modp_ti.engine.snapshots.snapshot import FILE, Snapshot, StreamDigest, of_another_program
 from modp_ti.files.errors import InputError
-from modp_ti.files.run_folder import appearing
+from modp_ti.files.run_folder import appearing, list_files
 from modp_ti.files.storage import Storage
+from modp_ti.inputs.protocol import Event, Tracker
+from modp_ti.inputs.sources.frame_store import list_frames
 
-__all__ = ["continued", "fetch_snapshot", "load_resumed", "replay"]
+__all__ = ["RECORDING", "Recovery", "continued", "discard", "fetch_snapshot", "load_resumed", "replay"]
+
+# Scene file in the output folder, which is there only while a live run goes on, or if it was killed.
+RECORDING = "recording.yaml"
+# Beginning of the names of the temporary folders in which live trackers keep what they receive.
+KEPT = "modp-ti-"
 
 # Settings that may change on resuming: the map does not depend on them, but for the device, in the last digits.
 FREE = (
@@ -129,9 +134,7 @@ def _progress(file: Path, config: SceneConfig) -> tuple[int, bool, int]:
     return snapshot.position.events, snapshot.position.finished, snapshot.position.refined
 
 
-def replay(
-    snapshot: Snapshot, mapper: Mapper, arriving: Iterator[TrackedFrame | PoseCorrection], digest: StreamDigest
-) -> None:
+def replay(snapshot: Snapshot, mapper: Mapper, arriving: Iterator[Event], digest: StreamDigest) -> None:
     """Read the snapshot's frames from the tracker again, and restore the mapper's state.
 
     Args:
@@ -166,3 +169,68 @@ def _changed(snapshot: Snapshot, how: str) -> InputError:
         f"{snapshot.path}: the input differs from that of the snapshot: {how}; restore the input, or start the run "
         "from its scene"
     )
+
+
+class Recovery:
+    """Writes a scene file of what a live tracker keeps to the output folder, and removes it when the run ends itself.
+
+    Args:
+        config: The run's settings.
+        tracker: The tracker.
+    """
+
+    def __init__(self, config: SceneConfig, tracker: Tracker) -> None:
+        self._config = config
+        self._tracker = tracker
+        self._written = False
+
+    def write(self) -> None:
+        """Write the file, if the tracker keeps something. Raises InputError if there is one, or it is unwritable."""
+        kept, settings = self._tracker.kept, self._config.without_clock().model_dump(mode="json")
+        if self._written or not kept:
+            return
+        if (self._config.output / RECORDING).exists():
+            raise InputError(
+                f"{self._config.output / RECORDING}: names the frames of a live run that was killed: map them with "
+                f"`modp-ti run --resume {self._config.output}`, or delete the file"
+            )
+        for section, changes in {**kept, "export": {"session": False}}.items():
+            settings[section] |= changes
+        try:
+            self._config.output.mkdir(parents=True, exist_ok=True)
+            list_files(self._config.output, [RECORDING])
+            dump_scene(SceneConfig.model_validate(settings, strict=False), self._config.output / RECORDING)
+        except OSError as error:
+            raise InputError(f"{self._config.output}: cannot be written: {error.strerror}") from None
+        self._written = True
+
+    def remove(self) -> None:
+        """Remove the file, as the tracker does with what it keeps."""
+        if self._written:
+            (self._config.output / RECORDING).unlink(missing_ok=True)
+
+
+def recovered(output: Path, overrides: Iterable[str]) -> SceneConfig | None:
+    """Return the settings that map what a killed live run has kept; None if there is none, or a later snapshot."""
+    file, snapshot = output / RECORDING, output / FILE
+    if not file.is_file() or (snapshot.is_file() and snapshot.stat().st_mtime > file.stat().st_mtime):
+        return None
+    config = load_scene(file, overrides)
+    folder = config.source.path
+    if folder is not None:
+        try:
+            list_frames(folder)
+        except OSError as error:
+            raise InputError(f"{file}: the frames of the recording are not in {folder}: {error.strerror}") from None
+    return config
+
+
+def discard(output: Path) -> None:
+    """Delete what a killed live run has kept, after a resumed run has finished its map."""
+    file = output / RECORDING
+    if file.is_file():
+        config = load_scene(file)
+        place = config.tracker.path if isinstance(config.tracker, SocketSettings) else config.source.path
+        if place is not None and (folder := place.parent if place.is_file() else place).name.startswith(KEPT):
+            shutil.rmtree(folder, ignore_errors=True)
+        file.unlink()

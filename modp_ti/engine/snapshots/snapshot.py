@@ -1,7 +1,11 @@
-"""`Snapshot`: the complete state of a run as arrays and numbers, with conversions to and from the run's objects."""
+"""`Snapshot`: the complete state of a run as arrays and numbers, with conversions to and from the run's objects.
+
+The file is an uncompressed .npz of plain arrays, one of which holds JSON. It contains no executable code.
+"""
 
 from __future__ import annotations
 
+import json
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -12,22 +16,35 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fields.frames.origin import NO_ORIGIN
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from fields.map.trajectory import Trajectory
-from modp_ti.engine.snapshots.file import read_arrays, write_arrays
-from modp_ti.files.reading import reading
+from modp_ti.files.atomic import replacing
+from modp_ti.files.errors import InputError
+from modp_ti.files.reading import open_file, readable, reading
 from modp_ti.inputs.delivered_frames import DeliveredFrames
 from modp_ti.outputs.evaluation import MapVersion
 from modp_ti.outputs.report.record import FrameNote, RunRecord, StepNote
 from modp_ti.version import __version__
 from pipelines.state import MapState
 
-__all__ = ["Position", "Snapshot", "StreamDigest", "frames_state", "record_state", "version_state"]
+__all__ = [
+    "FILE",
+    "Position",
+    "Snapshot",
+    "StreamDigest",
+    "frames_state",
+    "of_another_program",
+    "record_state",
+    "version_state",
+]
 
-AGAIN = "; the parts of the snapshot do not fit together: start the run from its scene"
+FILE = "snapshot.npz"
+# Version of the arrays and the JSON. Others are refused, as they hold the state of different code.
+VERSION = 6
+ABOUT = "about"
+AGAIN = "; start the run from its scene"
 UNKNOWN = np.full((3, 4), np.nan)
 # Saved columns of the record's frames and steps. None is saved as NaN.
 FRAME_COLUMNS = {
@@ -128,17 +145,24 @@ class Snapshot:
         return MapState(self.arrays, self.numbers["map"])
 
     def write(self, path: Path) -> None:
-        """Write the file to this path. Raises OSError if it cannot be written."""
+        """Write the file. The previous one is replaced once this one is on disk. Raises OSError if it is not."""
         about = {"settings": self.settings, "position": asdict(self.position), "numbers": self.numbers}
-        write_arrays(path, self.arrays, about)
+        text = json.dumps({"version": VERSION, "program": __version__, **about}).encode("utf-8")
+        with replacing(path) as file:
+            np.savez(file, allow_pickle=False, **self.arrays, **{ABOUT: np.frombuffer(text, dtype=np.uint8)})
 
     @classmethod
     def read(cls, path: Path) -> Snapshot:
-        """Read a snapshot. Raises InputError with one line if the file cannot be used."""
-        arrays, about = read_arrays(path)
-        with reading(path, AGAIN):
-            position, settings, numbers = Position(**about["position"]), dict(about["settings"]), dict(about["numbers"])
-            return cls(path, settings, position, arrays, numbers, about.get("program"))
+        """Read a snapshot. Raises InputError with one line if the file is missing, damaged or of another version."""
+        with reading(path, AGAIN), readable(path):
+            with open_file(path) as file, np.load(file, allow_pickle=False) as archive:
+                arrays = {name: archive[name] for name in archive.files}
+            about = json.loads(bytes(arrays.pop(ABOUT)))
+            version, program = about["version"], about["program"]
+            if version != VERSION:
+                raise of_another_program(path, program, f"its format is {version}, and this program's {VERSION}")
+            position = Position(**about["position"])
+            return cls(path, dict(about["settings"]), position, arrays, dict(about["numbers"]), program)
 
     @contextmanager
     def fitting(self) -> Iterator[None]:
@@ -147,26 +171,16 @@ class Snapshot:
             yield
 
     def number(self, *keys: str) -> float:
-        """Return a count or a number of seconds. Raises ValueError, TypeError or KeyError if it is neither."""
+        """Return a count or a number of seconds."""
         value: Any = self.numbers
         for key in keys:
             value = value[key]
-        number = float(value)
-        if not 0.0 <= number < 1e11:
-            raise ValueError(f"{keys[-1]}: {number} is no time and no count")
-        return number
+        return float(value)
 
     def frames(self, trajectory: Trajectory) -> DeliveredFrames:
-        """Return the metadata of the frames, for the map whose trajectory is given.
-
-        Raises:
-            KeyError, ValueError: If the metadata are incomplete or inconsistent.
-        """
+        """Return the log of the frames, for the map whose trajectory is given."""
         state = MapState(self.arrays, self.numbers["frames"])
         rows, points = state.group("frames"), state.group("points")
-        _require_columns(rows["index"], rows["timestamp"], rows["held_out"])
-        if not all(isinstance(name, str) for name in state.numbers["name"]) or not np.isfinite(rows["camera"]).all():
-            raise ValueError("a frame's name is no text, or its camera no camera")
         frames = DeliveredFrames(
             index=rows["index"].tolist(),
             name=list(state.numbers["name"]),
@@ -177,22 +191,11 @@ class Snapshot:
             ],
             held_out=rows["held_out"].tolist(),
             trajectory=trajectory,
-            corrections={name: int(state.numbers["corrections"][name]) for name in ("received", "moved")},
-            origin=np.array(state.numbers.get("origin", NO_ORIGIN), dtype=np.float64).reshape(3),
+            corrections=dict(state.numbers["corrections"]),
+            origin=np.array(state.numbers["origin"]),
         )
         frames.points.restore(points, frames.held_out)
-        if {len(part) for part in (frames.name, frames.timestamp, frames.camera)} != {len(frames)}:
-            raise ValueError("the frames' names, times and cameras differ in number")
-        self._require_like(frames_state(frames))
         return frames
-
-    def _require_like(self, again: MapState) -> None:
-        """Raise ValueError unless the arrays have the form in which the restored objects are written again."""
-        for name, array in again.arrays.items():
-            stored = self.arrays[name]
-            kinds = {each.dtype.kind.replace("u", "i") for each in (stored, array)}
-            if stored.shape != array.shape or len(kinds) > 1:
-                raise ValueError(f"{name} is {stored.dtype} of shape {stored.shape}, not {array.dtype} {array.shape}")
 
     def online(self) -> MapVersion | None:
         """Return the map before refinement, or None if refinement had not begun."""
@@ -201,34 +204,26 @@ class Snapshot:
         if not gaussians:
             return None
         exposures = [None if np.isnan(row).all() else row for row in poses["exposure"]]
-        version = MapVersion(gaussians, list(poses["T"]), exposures, int(state.numbers["view_renders"]))
-        self._require_like(version_state(version))
-        count, frames = len(gaussians["position"]), len(self.arrays["frames.index"])
-        forms = {"position": (3,), "log_scale": (3,), "quaternion": (4,), "opacity_logit": ()}
-        forms["sh"] = (*gaussians["sh"].shape[1:2], 3)
-        if {len(poses["T"]), len(exposures)} != {frames} or any(
-            gaussians[name].shape != (count, *form) for name, form in forms.items()
-        ):
-            raise ValueError("the map before refinement has another number of frames, or incomplete Gaussians")
-        return version
+        return MapVersion(gaussians, list(poses["T"]), exposures, int(state.numbers["view_renders"]))
 
     def record(self, record: RunRecord) -> None:
         """Copy the saved notes into a new record."""
         state = MapState(self.arrays, {})
         frames, steps = state.group("record"), state.group("record_steps")
-        _require_columns(*frames.values(), *steps.values())
         columns = {name: frames[name].tolist() for name in FRAME_COLUMNS}
         for name in ("psnr", "mapped_psnr"):
             columns[name] = [None if np.isnan(value) else value for value in columns[name]]
         record.frames = [FrameNote(*row) for row in zip(*columns.values(), strict=True)]
         record.steps = [StepNote(*row) for row in zip(*(steps[name].tolist() for name in STEP_COLUMNS), strict=True)]
         record.started = self.number("started")
-        self._require_like(record_state(record))
 
 
-def _require_columns(*arrays: NDArray) -> None:
-    if any(array.ndim != 1 for array in arrays):
-        raise ValueError("a column of frames or steps has several dimensions")
+def of_another_program(path: Path, program: object, difference: str) -> InputError:
+    """Return the error for a snapshot of another version of the program, with its difference."""
+    return InputError(
+        f"{path}: MODP-Ti {program} has written this snapshot, and MODP-Ti {__version__} cannot resume it "
+        f"({difference}); resume with that version, or start the run from its scene"
+    )
 
 
 def frames_state(frames: DeliveredFrames) -> MapState:
@@ -240,9 +235,7 @@ def frames_state(frames: DeliveredFrames) -> MapState:
         "camera": np.array(cameras, dtype=np.float64).reshape(-1, 6),
         "held_out": np.array(frames.held_out, dtype=bool),
     }
-    numbers = {"name": frames.name, "corrections": frames.corrections}
-    if frames.from_origin.any():
-        numbers["origin"] = frames.from_origin.tolist()
+    numbers = {"name": frames.name, "corrections": frames.corrections, "origin": frames.from_origin.tolist()}
     return MapState.of({"frames": rows, "points": frames.points.state()}, numbers)
 
 

@@ -15,9 +15,7 @@ from fields.runtime.backend import initialise
 from modp_ti.config.scene_file import load_scene
 from modp_ti.engine.mapper import Mapper
 from modp_ti.engine.run_clock import RunClock
-from modp_ti.engine.snapshots import Checkpointer, Snapshot, replay
-from modp_ti.engine.snapshots import file as snapshot_file
-from modp_ti.engine.snapshots.file import FILE
+from modp_ti.engine.snapshots import FILE, Checkpointer, Snapshot, replay
 from modp_ti.engine.snapshots.snapshot import StreamDigest
 from modp_ti.files.errors import InputError
 from modp_ti.files.run_folder import PRIVATE
@@ -91,7 +89,7 @@ def test_a_full_disk_keeps_the_snapshot_before_and_says_so_once(run: Run, monkey
         file.write(before[:1000])
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(snapshot_file.np, "savez", full)
+    monkeypatch.setattr(np, "savez", full)
     failed = run.checkpointer.failed
     for i in (FRAMES, FRAMES + 1):
         run.take(i)

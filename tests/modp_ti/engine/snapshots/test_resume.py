@@ -17,8 +17,8 @@ import numpy as np
 import pycolmap
 import pytest
 
-from modp_ti.engine.snapshots import load_resumed
-from modp_ti.engine.snapshots.file import FILE, read_arrays, write_arrays
+from modp_ti.engine.snapshots import FILE, Snapshot, load_resumed
+from modp_ti.engine.snapshots.snapshot import Position
 from modp_ti.files.errors import InputError
 from tests.modp_ti.runs import finished_run
 from tests.patience import PATIENCE
@@ -78,10 +78,10 @@ def start(*arguments: str) -> subprocess.Popen[str]:
 def position(file: Path) -> tuple[int, int]:
     """Frames and corrections taken in, and steps of refinement, of the snapshot; (-1, -1) without one."""
     try:
-        about = read_arrays(file)[1]["position"]
+        found = Snapshot.read(file).position
     except InputError:  # there is none, or the run replaced it while it was read
         return -1, -1
-    return about["events"], about["refined"]
+    return found.events, found.refined
 
 
 def stop_midway(
@@ -197,12 +197,8 @@ def stopped(tmp_path: Path) -> Path:
     (tmp_path / "scene.yaml").write_text(SCENE)
     config = load_scene(tmp_path / "scene.yaml")
     (tmp_path / "out").mkdir()
-    about = {
-        "settings": config.resolved(1.0).model_dump(mode="json"),
-        "position": {"events": 1, "digest": 5, "finished": False, "refined": 0},
-        "numbers": {},
-    }
-    write_arrays(tmp_path / "out" / FILE, {"a": np.zeros(1)}, about)
+    file = tmp_path / "out" / FILE
+    Snapshot(file, config.resolved(1.0).model_dump(mode="json"), Position(1, 5), {"a": np.zeros(1)}, {}).write(file)
     return tmp_path / "out"
 
 
@@ -237,20 +233,11 @@ def test_the_scale_that_auto_became_is_kept(stopped: Path) -> None:
 
 
 def test_settings_that_this_version_does_not_have_are_refused(stopped: Path) -> None:
-    arrays, about = read_arrays(stopped / FILE)
-    del about["version"]
-    about["settings"]["mapping"]["magic"] = 1
-    write_arrays(stopped / FILE, arrays, about)
+    snapshot = Snapshot.read(stopped / FILE)
+    snapshot.settings["mapping"]["magic"] = 1
+    snapshot.write(stopped / FILE)
     with pytest.raises(InputError, match=r"unknown key `mapping\.magic`"):
         load_resumed(stopped, None, [])
-
-
-def test_a_snapshot_with_the_keys_of_all_trackers_as_0_1_0_wrote_it_is_taken(stopped: Path) -> None:
-    arrays, about = read_arrays(stopped / FILE)
-    del about["version"]
-    about["settings"]["tracker"] |= {"points": None, "camera": "camera-rgb", "patience": 120.0}
-    write_arrays(stopped / FILE, arrays, about)
-    assert load_resumed(stopped, None, [])[0] == load_resumed(stopped, stopped.parent / "scene.yaml", [])[0]
 
 
 def test_a_folder_without_a_snapshot_says_what_to_do(tmp_path: Path) -> None:

@@ -9,9 +9,9 @@ import pytest
 
 from modp_ti.config.scene_file import load_scene
 from modp_ti.config.settings import SceneConfig
-from modp_ti.engine.snapshots import fetch_snapshot, load_resumed
-from modp_ti.engine.snapshots.file import FILE, read_arrays, write_arrays
-from modp_ti.engine.snapshots.store import SnapshotStore
+from modp_ti.engine.snapshots import FILE, Snapshot, fetch_snapshot, load_resumed
+from modp_ti.engine.snapshots.checkpointer import SnapshotStore
+from modp_ti.engine.snapshots.snapshot import Position
 from modp_ti.files.errors import InputError
 from modp_ti.files.run_folder import list_files
 from modp_ti.files.storage import StorageError
@@ -28,9 +28,8 @@ def config(tmp_path: Path) -> SceneConfig:
 def snapshot(file: Path, config: SceneConfig, events: int, refined: int = 0) -> Path:
     """A snapshot file of which nothing but its place in the run and its settings is real."""
     file.parent.mkdir(parents=True, exist_ok=True)
-    position = {"events": events, "digest": 5, "finished": refined > 0, "refined": refined}
-    about = {"settings": config.model_dump(mode="json"), "position": position, "numbers": {}}
-    write_arrays(file, {"a": np.zeros(1)}, about)
+    position = Position(events, 5, refined > 0, refined)
+    Snapshot(file, config.model_dump(mode="json"), position, {"a": np.zeros(1)}, {}).write(file)
     return file
 
 
@@ -40,8 +39,8 @@ def put(file: Path, config: SceneConfig) -> None:
 
 
 def place(file: Path) -> tuple[int, int]:
-    position = read_arrays(file)[1]["position"]
-    return position["events"], position["refined"]
+    position = Snapshot.read(file).position
+    return position.events, position.refined
 
 
 @pytest.mark.parametrize(
