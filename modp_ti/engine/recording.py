@@ -19,19 +19,17 @@ from numpy.typing import NDArray
 
 from fields.frames.camera_revision import CameraRevision
 from fields.frames.pose_correction import PoseCorrection
-from fields.frames.tracked_frame import SparsePoints, TrackedFrame
+from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from modp_ti.engine.conductor import Conductor
 from modp_ti.engine.interruption import Interruption
 from modp_ti.engine.mapper import Mapper
 from modp_ti.engine.prefetch import FramesAhead
 from modp_ti.files.errors import InputError
-from modp_ti.files.limits import BoundedZip, arrays_of
 from modp_ti.files.reading import reading
+from modp_ti.inputs.frame_record import FrameRecord
 from modp_ti.inputs.protocol import Event, Tracker
 from modp_ti.inputs.sources import Picture
-from modp_ti.inputs.sources.image_header import why_undecodable
-from modp_ti.inputs.sources.image_pixels import decoded_as
 from pipelines.companions.pace import Plan
 from pipelines.companions.realtime_pace import RecordedPace
 from pipelines.refinement import Schedule
@@ -41,10 +39,9 @@ __all__ = ["FILE", "RecordedSession", "ReplayedRun", "SessionRecorder"]
 
 FILE = "session.zip"
 # Version of the file. Others are refused.
-VERSION = 2
+VERSION = 3
 ABOUT = "about.json"
 AGAIN = "; record the session again"
-KINDS = "biufU"  # of the arrays: numbers, and names
 # Arrays of a correction, and of its camera where it has one.
 CORRECTION = ("index", "T_camera_world", "ids", "xyz")
 REVISION = ("lookup", "covered")
@@ -76,21 +73,8 @@ class SessionRecorder:
     def add_frame(self, frame: TrackedFrame) -> None:
         """Write a frame."""
         _, image = cv2.imencode(".png", frame.rgba, [cv2.IMWRITE_PNG_COMPRESSION, 1])
-        points = frame.points
-        arrays = {
-            "index": np.array(frame.index),
-            "timestamp": np.array(frame.timestamp),
-            "arrived": np.array(np.nan if frame.arrived is None else frame.arrived),
-            "name": np.array(frame.name),
-            "image": image,
-            "camera": _numbers(frame.camera),
-            "T_camera_world": frame.T_camera_world,
-            "xyz": points.xyz,
-            "pixels": points.pixels,
-            "ids": points.ids,
-            "masked": np.array(frame.mask is not None),
-            "held_out": np.array(frame.held_out),
-        }
+        arrays = FrameRecord.of(frame).arrays()
+        arrays |= {"image": image, "camera": _numbers(frame.camera), "masked": np.array(frame.mask is not None)}
         if frame.vignette is not None and frame.vignette is not self._vignette:
             self._vignette = arrays["vignette"] = frame.vignette
         self._write(arrays)
@@ -187,7 +171,7 @@ class RecordedSession(Tracker):
         if not self.path.is_file():
             raise InputError(f"{self.path}: there is no recorded session; record one with `export.session: true`")
         with reading(self.path, AGAIN):
-            self._zip = BoundedZip(self.path, stored=True)
+            self._zip = zipfile.ZipFile(self.path)
             about = json.loads(self._zip.read(ABOUT))
             if about["version"] != VERSION:
                 raise InputError(f"{self.path}: a session of version {about['version']}, this program reads {VERSION}")
@@ -236,12 +220,11 @@ class RecordedSession(Tracker):
             yield event
 
     def close(self) -> None:
-        """Close the file."""
         self._zip.close()
 
     def _arrays(self, name: str) -> dict[str, NDArray]:
-        with BoundedZip(self._zip.read(name), stored=True) as archive:
-            return arrays_of(archive, KINDS)
+        with np.load(io.BytesIO(self._zip.read(name)), allow_pickle=False) as archive:
+            return dict(archive)
 
 
 def _numbers(camera: PinholeCamera) -> NDArray[np.float64]:
@@ -254,22 +237,12 @@ def _camera(numbers: NDArray[np.float64]) -> PinholeCamera:
 
 
 def _frame(arrays: dict[str, NDArray], vignette: NDArray[np.float32] | None) -> TrackedFrame:
-    data = arrays["image"].tobytes()
-    rgba = None if why_undecodable(data) else decoded_as(data, cv2.IMREAD_UNCHANGED)
+    rgba = cv2.imdecode(arrays["image"], cv2.IMREAD_UNCHANGED)
     if rgba is None or rgba.dtype != np.uint8:
         raise ValueError("its picture is damaged")
-    return TrackedFrame(
-        index=int(arrays["index"]),
-        timestamp=float(arrays["timestamp"]),
-        name=str(arrays["name"]),
-        image=np.divide(rgba[..., :3], np.float32(255.0), dtype=np.float32),
-        camera=_camera(arrays["camera"]),
-        T_camera_world=arrays["T_camera_world"],
-        points=SparsePoints(arrays["xyz"], arrays["pixels"], arrays["ids"]),
-        mask=rgba[..., 3] > 0 if bool(arrays["masked"]) else None,
-        vignette=vignette,
-        held_out=bool(arrays["held_out"]),
-    )
+    image, mask = np.divide(rgba[..., :3], np.float32(255.0), dtype=np.float32), rgba[..., 3] > 0
+    picture = Picture(image, mask if bool(arrays["masked"]) else None, vignette, _camera(arrays["camera"]))
+    return FrameRecord.of_arrays(arrays).with_picture(picture)
 
 
 def _correction(arrays: dict[str, NDArray]) -> PoseCorrection:

@@ -13,6 +13,7 @@ from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from fields.map.trajectory import Trajectory
+from modp_ti.inputs.frame_record import FrameRecord
 from modp_ti.inputs.protocol import Tracker
 from modp_ti.inputs.tracked_points import TrackedPoints
 
@@ -105,18 +106,11 @@ class DeliveredFrames:
         for name, picture in tracker.pictures(self.name):
             place = places[name]
             rows, pixels = self.points.rows[place], self.points.pixels[place].astype(np.float64)
-            yield TrackedFrame(
-                index=self.index[place],
-                timestamp=self.timestamp[place],
-                name=name,
-                image=picture.image,
-                camera=self.camera[place],
-                T_camera_world=self.trajectory[self.index[place]],
-                points=SparsePoints(xyz[rows], pixels, ids[rows]),
-                mask=picture.mask,
-                vignette=picture.vignette,
-                held_out=self.held_out[place],
+            points, index = SparsePoints(xyz[rows], pixels, ids[rows]), self.index[place]
+            record = FrameRecord(
+                index, self.timestamp[place], name, self.trajectory[index], points, self.held_out[place]
             )
+            yield record.with_picture(picture)
 
 
 def settled(tracker: Tracker) -> Iterator[TrackedFrame]:

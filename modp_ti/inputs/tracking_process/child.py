@@ -6,6 +6,7 @@ import os
 import queue
 import sys
 import threading
+from collections import deque
 from contextlib import suppress
 from multiprocessing.connection import Connection
 
@@ -16,27 +17,35 @@ from fields.frames.tracked_frame import TrackedFrame
 from modp_ti.files.ending_signals import left_to_parent
 from modp_ti.files.errors import InputError
 from modp_ti.files.terminal import own_terminal
+from modp_ti.inputs.frame_record import FrameRecord
 from modp_ti.inputs.klt import KltTracker, open_klt
 from modp_ti.inputs.opening import open_source
 from modp_ti.inputs.readers.klt import KltSettings
 from modp_ti.inputs.sources import FrameReader, ImageSource, Undistorter
-from modp_ti.inputs.tracking_process.frame_record import FrameRecord
-from modp_ti.inputs.tracking_process.frame_ring import CountsBoard, FrameRing, SlotLayout
-from modp_ti.inputs.tracking_process.messages import (
+from modp_ti.inputs.tracking_process.exchange import (
     CameraRevised,
+    CountsBoard,
     Delivered,
     Ended,
+    FrameRing,
     Job,
     Opened,
     Preparing,
     RingMade,
+    SlotLayout,
 )
-from modp_ti.inputs.tracking_process.outbox import Outbox
 
-__all__ = ["main"]
+__all__ = ["Outbox", "main"]
 
 # Interval [s] at which the counts are published and the wish to finish is noticed.
 GLANCE = 0.05
+# Events that may wait for the mapper. A frame without its image takes some 15 KB.
+LIMIT = 2000
+# Memory of the images of waiting frames [bytes], for example of 140 frames of 320x240. Reading an image again takes a
+# third of the time of tracking it, on the same core: with room for four, a stream of 30 frames a second fell behind.
+ROOM = 128 << 20
+
+_Message = PoseCorrection | CameraRevised | Ended
 
 
 def main() -> None:
@@ -137,7 +146,7 @@ class _Child:
                         ring = FrameRing(self._memory, SlotLayout.of(event), self._slots)
                         self._connection.send(RingMade(ring.layout, event.vignette))
                     ring.write(slot, event)
-                    self._connection.send(Delivered(slot, FrameRecord.of(event), event.mask is not None))
+                    self._connection.send(Delivered(slot, FrameRecord.of(event), event.camera, event.mask is not None))
                 else:
                     if isinstance(event, CameraRevised):
                         undistorter = event.intrinsics.undistorter(self._tracker.scale)
@@ -173,3 +182,43 @@ class _Child:
                 how = f"modp-ti run --resume {self._job.config.output}"
                 sys.stderr.write(f"error: the mapper has ended; {how} maps the frames that were recorded\n")
             os._exit(1)
+
+
+class Outbox:
+    """Queue of frames and corrections, in order.
+
+    Waiting frames keep their images while these fit into `room`. The images of the others are read again when it is
+    their turn. The tracker is not held up before `LIMIT` events wait.
+
+    Args:
+        room: Memory of the images [bytes]. One frame keeps its image in any case.
+    """
+
+    def __init__(self, room: int = ROOM) -> None:
+        self._room = room
+        self._taken = 0
+        self._events: deque[TrackedFrame | FrameRecord | _Message] = deque()
+        self._changed = threading.Condition()
+
+    def put(self, event: TrackedFrame | _Message) -> None:
+        """Append an event; wait while the queue is full."""
+        with self._changed:
+            self._changed.wait_for(lambda: len(self._events) < LIMIT)
+            if not isinstance(event, TrackedFrame):
+                self._events.append(event)
+            elif self._taken == 0 or self._taken + event.image.nbytes <= self._room:
+                self._taken += event.image.nbytes
+                self._events.append(event)
+            else:
+                self._events.append(FrameRecord.of(event))
+            self._changed.notify_all()
+
+    def get(self) -> TrackedFrame | FrameRecord | _Message:
+        """Take the first event; wait for it."""
+        with self._changed:
+            self._changed.wait_for(lambda: len(self._events) > 0)
+            event = self._events.popleft()
+            if isinstance(event, TrackedFrame):
+                self._taken -= event.image.nbytes
+            self._changed.notify_all()
+            return event

@@ -26,15 +26,17 @@ from modp_ti.inputs.protocol import Event, LiveCounts, Progress, Tracker
 from modp_ti.inputs.replay import pictures_again
 from modp_ti.inputs.sources import FrameReader, Picture, Undistorter
 from modp_ti.inputs.sources.frame_store import StoredFrames, kept_frames
-from modp_ti.inputs.tracking_process.frame_ring import CountsBoard, FrameRing, anonymous_memory
-from modp_ti.inputs.tracking_process.messages import (
+from modp_ti.inputs.tracking_process.exchange import (
     CameraRevised,
+    CountsBoard,
     Delivered,
     Ended,
+    FrameRing,
     Job,
     Opened,
     Preparing,
     RingMade,
+    anonymous_memory,
 )
 
 __all__ = ["TrackingProcess"]
@@ -205,7 +207,7 @@ class TrackingProcess(Tracker):
 
     def _delivered(self, message: Delivered) -> TrackedFrame:
         assert self._ring is not None
-        frame = self._ring.read(message.slot, message.record, message.masked, self._vignette)
+        frame = self._ring.read(message, self._vignette)
         self._taken += 1
         try:
             self._connection.send(message.slot)

@@ -9,6 +9,7 @@ from dataclasses import replace
 from fields.frames.origin import shifted
 from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from modp_ti.inputs.colmap_model import read_colmap_model
+from modp_ti.inputs.frame_record import FrameRecord
 from modp_ti.inputs.sources import Picture
 from modp_ti.outputs.playback.finished_run import FinishedRun
 from modp_ti.outputs.playback.run_pictures import Preparing, pictures
@@ -79,14 +80,6 @@ def frames_of(run: FinishedRun, places: Sequence[int], preparing: Preparing | No
     held_out = set(run.record.held_out)
     with closing(pictures(run, preparing, places)) as images:
         for place, picture in zip(places, images, strict=True):
-            yield TrackedFrame(
-                index=place,
-                timestamp=float(run.timestamps[place]),
-                name=run.names[place],
-                image=picture.image,
-                camera=run.cameras[place],
-                T_camera_world=run.poses[place],
-                mask=picture.mask,
-                vignette=picture.vignette,
-                held_out=place in held_out,
-            )
+            time, name = float(run.timestamps[place]), run.names[place]
+            record = FrameRecord(place, time, name, run.poses[place], SparsePoints(), place in held_out)
+            yield record.with_picture(picture)

@@ -9,9 +9,9 @@ import pytest
 
 from fields.frames.tracked_frame import TrackedFrame
 from modp_ti.files.errors import InputError
+from modp_ti.inputs.frame_record import FrameRecord
 from modp_ti.inputs.protocol import LiveCounts
-from modp_ti.inputs.tracking_process.frame_record import FrameRecord
-from modp_ti.inputs.tracking_process.frame_ring import CountsBoard, FrameRing, SlotLayout, anonymous_memory
+from modp_ti.inputs.tracking_process.exchange import CountsBoard, Delivered, FrameRing, SlotLayout, anonymous_memory
 from tests.modp_ti.inputs.tracking_process.frames import assert_same, random_frame
 
 
@@ -23,7 +23,7 @@ def memory():
 
 
 def read(ring: FrameRing, slot: int, frame: TrackedFrame) -> TrackedFrame:
-    return ring.read(slot, FrameRecord.of(frame), frame.mask is not None, None)
+    return ring.read(Delivered(slot, FrameRecord.of(frame), frame.camera, frame.mask is not None), None)
 
 
 def test_frames_pass_through_reused_slots_byte_for_byte(memory):

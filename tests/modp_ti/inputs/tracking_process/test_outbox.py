@@ -8,10 +8,10 @@ import numpy as np
 
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
+from modp_ti.inputs.frame_record import FrameRecord
 from modp_ti.inputs.sources import Picture
-from modp_ti.inputs.tracking_process import outbox as module
-from modp_ti.inputs.tracking_process.frame_record import FrameRecord
-from modp_ti.inputs.tracking_process.outbox import Outbox
+from modp_ti.inputs.tracking_process import child as module
+from modp_ti.inputs.tracking_process.child import Outbox
 from tests.modp_ti.inputs.tracking_process.frames import assert_same, random_frame
 from tests.patience import PATIENCE
 
@@ -29,7 +29,9 @@ def test_order_is_kept_and_only_the_first_frames_keep_their_images():
     got = [outbox.get() for _ in range(5)]
     assert got[0] is frames[1] and got[2] is correction and got[3] is frames[3]
     assert isinstance(got[1], FrameRecord) and isinstance(got[4], FrameRecord)
-    assert_same(got[1].with_picture(Picture(frames[2].image, None, None, frames[2].camera)), frames[2])
+    picture = Picture(frames[2].image, None, None, frames[2].camera)
+    assert_same(got[1].with_picture(picture), frames[2])
+    assert_same(FrameRecord.of_arrays(got[1].arrays()).with_picture(picture), frames[2])
 
 
 def test_the_tracker_waits_only_at_the_limit(monkeypatch):

@@ -1,26 +1,112 @@
-"""Shared memory of the two processes: slots for frames, and the counts of the stream."""
+"""What the two processes exchange: messages through the pipe, and frames and counts in shared memory."""
 
 from __future__ import annotations
 
 import mmap
 import os
 import tempfile
+from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fields.frames.pyramid import ImageLevel
 from fields.frames.tracked_frame import TrackedFrame
-from modp_ti.files.errors import InputError
+from fields.geometry.camera import PinholeCamera
+from modp_ti.config.settings import SceneConfig
+from modp_ti.files.errors import InputError, UnreadableImageError
+from modp_ti.inputs.frame_record import FrameRecord
 from modp_ti.inputs.protocol import LiveCounts
-from modp_ti.inputs.sources import Picture
-from modp_ti.inputs.tracking_process.frame_record import FrameRecord
+from modp_ti.inputs.sources import Intrinsics, Picture
 
-__all__ = ["CountsBoard", "FrameRing", "SlotLayout", "anonymous_memory"]
+__all__ = [
+    "CameraRevised",
+    "CountsBoard",
+    "Delivered",
+    "Ended",
+    "FrameRing",
+    "Job",
+    "Opened",
+    "Preparing",
+    "RingMade",
+    "SlotLayout",
+    "anonymous_memory",
+]
 
 # Numbers of a `CountsBoard`: the counts, the number of frames, the wish to finish, and whether the stream goes on.
 NUMBERS = 8
+
+# ---- the pipe --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Job:
+    """To the child: what to track. A live source stores its frames in `folder`, which belongs to the parent."""
+
+    config: SceneConfig
+    folder: Path | None
+
+
+@dataclass(frozen=True)
+class Preparing:
+    """Progress while the tracker is opened, as for `Progress`."""
+
+    what: str
+    done: int
+    total: int
+
+
+@dataclass(frozen=True)
+class Opened:
+    """The tracker is open."""
+
+    notes: list[str]
+    scale: float
+    intrinsics: Intrinsics
+
+
+@dataclass(frozen=True)
+class CameraRevised:
+    """The correction that follows, and all frames after it, have another camera.
+
+    Attributes:
+        intrinsics: The camera of the stored images.
+    """
+
+    intrinsics: Intrinsics
+
+
+@dataclass(frozen=True)
+class RingMade:
+    """The ring has its size, which the first frame determines. The vignette is that of all frames of a camera."""
+
+    layout: SlotLayout
+    vignette: NDArray[np.float32] | None
+
+
+@dataclass(frozen=True)
+class Delivered:
+    """A frame is in a slot of the ring. The parent answers with the slot's number when it has copied it."""
+
+    slot: int
+    record: FrameRecord
+    camera: PinholeCamera
+    masked: bool
+
+
+@dataclass(frozen=True)
+class Ended:
+    """The stream has ended, by an error of the input or a failure of the tracker if one is given."""
+
+    notes: list[str]
+    unreadable: Mapping[str, UnreadableImageError]
+    error: InputError | None = None
+    failure: str | None = None
+
+
+# ---- shared memory ---------------------------------------------------------------------------------------------------
 
 
 def anonymous_memory() -> int:
@@ -96,18 +182,11 @@ class FrameRing:
         if frame.mask is not None:
             np.copyto(mask, frame.mask)
 
-    def read(self, slot: int, record: FrameRecord, masked: bool, vignette: NDArray[np.float32] | None) -> TrackedFrame:
-        """Return the frame in a slot. Its arrays are copies.
-
-        Args:
-            slot: The slot.
-            record: The frame without its image.
-            masked: Whether the frame has a mask.
-            vignette: Its vignette.
-        """
-        image, levels, mask = self._arrays(slot)
-        frame = record.with_picture(Picture(image.copy(), mask.copy() if masked else None, vignette, record.camera))
-        pyramid, camera = [], frame.camera
+    def read(self, sent: Delivered, vignette: NDArray[np.float32] | None) -> TrackedFrame:
+        """Return a frame in its slot, given its message and vignette. Its arrays are copies."""
+        image, levels, mask = self._arrays(sent.slot)
+        picture = Picture(image.copy(), mask.copy() if sent.masked else None, vignette, sent.camera)
+        frame, pyramid, camera = sent.record.with_picture(picture), [], sent.camera
         for level in levels:
             height, width = level.shape[:2]
             camera = camera if (width, height) == (camera.width, camera.height) else camera.resized(width, height)
