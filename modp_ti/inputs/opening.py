@@ -76,8 +76,9 @@ def open_tracker(config: SceneConfig, progress: Progress | None = None) -> Track
         InputError: If the input is invalid.
 
     Example:
-        for frame in modp_ti.open_tracker(modp_ti.load_scene("scene.yaml")):
-            print(frame.name, len(frame.points))
+        for event in modp_ti.open_tracker(modp_ti.load_scene("scene.yaml")):
+            if isinstance(event, modp_ti.TrackedFrame):  # not a correction of earlier frames
+                print(event.name, len(event.points))
     """
     of_tracker = dict(config.tracker).get("path")
     with reading(of_tracker or config.source.path or "source.stream"):
