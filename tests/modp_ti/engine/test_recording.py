@@ -1,4 +1,5 @@
 """A recorded realtime run, repeated: the same bytes, whatever the clock says now."""
+# pyright: reportAttributeAccessIssue=false
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
 """A tracker need only have notes and frames: what few can do has a default."""
+# pyright: reportAbstractUsage=false
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
 """Copies of snapshots: the further one is taken, and a storage that fails costs one line."""
+# pyright: reportOptionalMemberAccess=false
 
 from __future__ import annotations
 

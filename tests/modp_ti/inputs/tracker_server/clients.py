@@ -1,4 +1,5 @@
 """A server with somebody before it: connections that send bytes written out by hand."""
+# pyright: reportArgumentType=false
 
 from __future__ import annotations
 

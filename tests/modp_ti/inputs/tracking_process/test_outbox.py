@@ -1,4 +1,5 @@
 """Frames wait for the mapper in order, most of them without their images, and do not hold up the tracker."""
+# pyright: reportAttributeAccessIssue=false
 
 from __future__ import annotations
 
