@@ -89,9 +89,9 @@ def compile_size(config: SceneConfig, size: tuple[int, int] | None) -> tuple[str
     from fields.geometry.camera import PinholeCamera
     from fields.runtime.backend import initialise
     from modp_ti.engine.build import EXPECTED, build_mapper
-    from modp_ti.inputs.opening import open_tracker
     from modp_ti.engine.conductor import first_frame
     from modp_ti.engine.prefetch import FramesAhead
+    from modp_ti.inputs.opening import open_tracker
 
     try:
         backend = initialise(config.device, config.threads, config.seed)

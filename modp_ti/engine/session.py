@@ -35,8 +35,7 @@ from modp_ti.files.run_folder import run_folder
 from modp_ti.files.urls import without_secrets
 from modp_ti.inputs.inspection.geometry import require_fitting
 from modp_ti.inputs.opening import open_tracker
-from modp_ti.inputs.protocol import Tracker
-from modp_ti.inputs.protocol import Event
+from modp_ti.inputs.protocol import Event, Tracker
 from modp_ti.inputs.replay import ReplayedTracker
 from modp_ti.inputs.scene_paths import refuse_output_in_input
 from modp_ti.inputs.timed_poses import open_ground_truth, true_poses

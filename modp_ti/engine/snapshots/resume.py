@@ -11,13 +11,13 @@ from fields.frames.tracked_frame import TrackedFrame
 from modp_ti.config.keys import as_yaml, differing_keys, leaves
 from modp_ti.config.scene_file import dump_scene, load_scene, scene_from_data
 from modp_ti.config.settings import SceneConfig
-from modp_ti.inputs.readers.socket import SocketSettings
 from modp_ti.engine.mapper import Mapper
 from modp_ti.engine.snapshots.snapshot import FILE, Snapshot, StreamDigest, of_another_program
 from modp_ti.files.errors import InputError
 from modp_ti.files.run_folder import appearing, list_files
 from modp_ti.files.storage import Storage
 from modp_ti.inputs.protocol import Event, Tracker
+from modp_ti.inputs.readers.socket import SocketSettings
 from modp_ti.inputs.sources.frame_store import list_frames
 
 __all__ = ["RECORDING", "Recovery", "continued", "discard", "fetch_snapshot", "load_resumed", "replay"]

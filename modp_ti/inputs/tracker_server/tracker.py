@@ -6,9 +6,9 @@ import struct
 from collections.abc import Iterator, Mapping, Sequence
 from queue import Empty, Full, Queue
 from socket import socket
-from typing import TYPE_CHECKING, ClassVar
 from threading import Event as Flag
 from threading import Thread
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
