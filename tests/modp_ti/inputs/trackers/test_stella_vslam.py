@@ -147,7 +147,7 @@ def changed(change):
         (lambda w: w.update(keyframes={}), ["holds no keyframe"]),
         (lambda w: w.update(landmarks={}), ["holds no landmark"]),
         (lambda w: w.pop("landmarks"), ["holds no `landmarks`"]),
-        (lambda w: w.update(keyframes=[1, 2]), ["keyframes: a table of names is expected"]),
+        (lambda w: w.update(keyframes=[1, 2]), ["map.msg"]),
         (lambda w: w["cameras"]["webcam"].update(model_type="Equirectangular"), ["Equirectangular"]),
         (lambda w: w["cameras"]["webcam"].update(fx="wide"), ["`fx` must be a number"]),
         (lambda w: w["cameras"]["webcam"].update(fx=-3.0), ["focal lengths must be positive"]),
