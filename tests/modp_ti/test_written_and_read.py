@@ -1,5 +1,4 @@
 """What our writers write, whatever it is, our readers give back."""
-# pyright: reportArgumentType=false, reportCallIssue=false
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ def corpus() -> dict[str, list[Content]]:
 def add_to_corpus(kind: str, contents: Iterable[tuple[str, str, bytes]]) -> None:
     """Add files, as (file, hash, content), to the corpus."""
     with tarfile.open(ARCHIVE) as archive:
-        members = {each.name: archive.extractfile(each).read() for each in archive}  # pyright: ignore
+        members = {each.name: archive.extractfile(each).read() for each in archive}
     members |= {f"{kind}/{file.replace('/', '|')}/{name}": data for file, name, data in contents}
     with tarfile.open(ARCHIVE, "w:xz", preset=9) as archive:
         for name, data in sorted(members.items()):

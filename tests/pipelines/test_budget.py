@@ -1,5 +1,4 @@
 """Maps within a budget of memory, and large ones."""
-# pyright: reportArgumentType=false, reportOperatorIssue=false, reportOptionalMemberAccess=false
 
 from __future__ import annotations
 

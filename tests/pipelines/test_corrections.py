@@ -1,5 +1,4 @@
 """Corrections of a tracker, on the wall of test_mapping.py, whose right poses are known."""
-# pyright: reportArgumentType=false, reportOptionalMemberAccess=false, reportOptionalOperand=false
 
 from __future__ import annotations
 

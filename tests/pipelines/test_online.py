@@ -1,5 +1,4 @@
 """The online loop and its parts on a small wall: a picture on a slanted plane, seen by a camera that moves sideways."""
-# pyright: reportArgumentType=false
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
 """A map of two walls at places apart, where Gaussians of the first place show in the views of the second."""
-# pyright: reportArgumentType=false
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
 """What a tracker delivers: frames, their pyramids, and corrections."""
-# pyright: reportArgumentType=false
 
 from __future__ import annotations
 

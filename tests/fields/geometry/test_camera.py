@@ -1,5 +1,4 @@
 """The camera model, the metric of its pixels, and vectors in kernels."""
-# pyright: reportArgumentType=false, reportInvalidTypeForm=false
 
 import cv2
 import numpy as np

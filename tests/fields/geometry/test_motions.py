@@ -1,5 +1,4 @@
 """Rigid motions and similarities: laws of the group, against SciPy and PyTorch."""
-# pyright: reportArgumentType=false
 
 from __future__ import annotations
 

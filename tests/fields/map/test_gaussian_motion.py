@@ -1,5 +1,4 @@
 """The move of Gaussians against NumPy and SciPy."""
-# pyright: reportOptionalMemberAccess=false
 
 from __future__ import annotations
 

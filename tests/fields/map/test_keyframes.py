@@ -1,5 +1,4 @@
 """Keyframes: what they share, what moves with them, masks, and their state."""
-# pyright: reportArgumentType=false, reportCallIssue=false, reportOperatorIssue=false
 
 from __future__ import annotations
 

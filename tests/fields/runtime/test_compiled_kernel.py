@@ -1,5 +1,3 @@
-# pyright: reportArgumentType=false, reportInvalidTypeForm=false, reportOptionalMemberAccess=false
-
 import numpy as np
 import pytest
 import torch

@@ -121,7 +121,7 @@ def test_what_fails_while_it_is_made_harms_nothing() -> None:
     field = gaussians()
     for size in (64.5, "64", None):
         with pytest.raises((TypeError, ValueError)):
-            Renderer(field, size, 48)  # pyright: ignore[reportArgumentType]
+            Renderer(field, size, 48)
     assert Renderer(field, 16, 16).render(CAMERA, np.eye(4), 0.01).opacity.max() > 0.4
 
 

@@ -1,5 +1,4 @@
 """Occupancy voxels, and laws that hold for any points."""
-# pyright: reportArgumentType=false
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
 """`modp-ti render` and `modp-ti export` on the output folder of a real, small run."""
-# pyright: reportArgumentType=false, reportOptionalMemberAccess=false
-# pyright: reportOptionalOperand=false, reportOptionalSubscript=false, reportReturnType=false
 
 from __future__ import annotations
 

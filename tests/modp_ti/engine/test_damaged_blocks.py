@@ -1,5 +1,4 @@
 """A file of blocks that is damaged while a map is made."""
-# pyright: reportArgumentType=false
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
 """`LiveViewer` as the observer of a run: it changes nothing, and nothing that befalls it stops the run."""
-# pyright: reportArgumentType=false, reportAttributeAccessIssue=false
 
 from __future__ import annotations
 

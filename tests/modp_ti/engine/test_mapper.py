@@ -114,7 +114,7 @@ def test_a_correction_moves_the_poses_but_of_no_frame_to_come(mapper: Mapper) ->
 def test_a_refinement_has_a_whole_number_of_steps(mapper: Mapper, steps: object) -> None:
     before = mapper.pipeline.renderer.view_renders
     with pytest.raises((TypeError, ValueError), match=r"^[^\n]+$"):
-        mapper.refine(steps)  # pyright: ignore[reportArgumentType]
+        mapper.refine(steps)
     assert mapper.pipeline.renderer.view_renders == before
 
 

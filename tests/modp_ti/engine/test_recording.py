@@ -1,5 +1,4 @@
 """A recorded realtime run, repeated: the same bytes, whatever the clock says now."""
-# pyright: reportAttributeAccessIssue=false
 
 from __future__ import annotations
 

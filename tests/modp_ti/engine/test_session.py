@@ -1,7 +1,4 @@
 """Whole runs of a small room, short, as a user starts them: in processes of their own."""
-# pyright: reportArgumentType=false, reportCallIssue=false
-# pyright: reportOptionalCall=false, reportOptionalMemberAccess=false, reportOptionalSubscript=false
-# pyright: reportAttributeAccessIssue=false
 
 from __future__ import annotations
 

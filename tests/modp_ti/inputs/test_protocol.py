@@ -1,5 +1,4 @@
 """A tracker need only have notes and frames: what few can do has a default."""
-# pyright: reportAbstractUsage=false
 
 from __future__ import annotations
 

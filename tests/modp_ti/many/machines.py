@@ -13,7 +13,7 @@ __all__ = ["made_cluster", "other_machine"]
 
 def made_cluster() -> Any:
     """A cluster of a head, which runs no calls, and two machines of one core. Whoever makes it shuts it down."""
-    from ray.cluster_utils import Cluster  # pyright: ignore[reportMissingImports] - an extra
+    from ray.cluster_utils import Cluster  # an extra
 
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0})
     for _ in range(2):
@@ -36,7 +36,7 @@ class Machine:
 
 def other_machine(cluster: Any) -> Machine:
     """A machine that runs calls, and is not the one that this process is connected to, whose loss would end it."""
-    import ray  # pyright: ignore[reportMissingImports] - an extra
+    import ray  # an extra
 
     ours = ray.get_runtime_context().get_node_id()
     return Machine(next(node for node in cluster.worker_nodes if node.node_id != ours))

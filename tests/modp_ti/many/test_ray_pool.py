@@ -24,7 +24,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture
 def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    import ray  # pyright: ignore[reportMissingImports] - an extra
+    import ray  # an extra
 
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([os.getcwd(), *sys.path]))  # for the processes of the cluster
     made = made_cluster()
@@ -82,7 +82,7 @@ def test_a_cluster_of_its_own_lets_nobody_in_and_joins_no_other(
         monkeypatch.delenv(name, raising=False)
     outside = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")}
     with open_pool("ray", tmp_path):
-        import ray  # pyright: ignore[reportMissingImports] - an extra
+        import ray  # an extra
 
         address = ray.get_runtime_context().gcs_address
         assert address != cluster.address  # which Ray's temporary folder names

@@ -1,5 +1,4 @@
 """Scores of frames and trajectories, against their definitions."""
-# pyright: reportArgumentType=false, reportCallIssue=false, reportOptionalOperand=false
 
 from __future__ import annotations
 

@@ -1,4 +1,3 @@
-# pyright: reportPossiblyUnboundVariable=false
 from __future__ import annotations
 
 from types import SimpleNamespace

@@ -1,5 +1,4 @@
 """A room is visited twice, and something has come or gone in between. The room as it is now is known."""
-# pyright: reportArgumentType=false
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
 """Gaussians that hardly show are removed while the map grows."""
-# pyright: reportArgumentType=false, reportAttributeAccessIssue=false
 
 from __future__ import annotations
 
@@ -108,14 +107,14 @@ def sweeps(missing: list[int], already: int = 0, apart: int | None = None) -> di
         anchors_at=lambda keyframes: none.astype(bool),
     )
     budget = SimpleNamespace(limit=None, voxels=None)
-    paging = Paging(gaussians, store, budget, SETTINGS)  # pyright: ignore[reportArgumentType]
+    paging = Paging(gaussians, store, budget, SETTINGS)
     paging.most_missing = 10
     paging.before_views = paging.away.remove_hidden = lambda *_: None
     measured: list[int] = []
     contribution = SimpleNamespace(
         begin=measured.clear, measure=lambda views, near, level: measured.extend(view.index for view in views)
     )
-    hidden = HiddenGaussians(contribution, densifier, paging, 0.5)  # pyright: ignore[reportArgumentType]
+    hidden = HiddenGaussians(contribution, densifier, paging, 0.5)
     found = {}
     for number, count in enumerate(missing):
         view = store.append(replace(one if apart is None or number < apart else there, index=number))

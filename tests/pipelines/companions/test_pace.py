@@ -1,5 +1,4 @@
 """The pace: complete, realtime with a clock of its own, and recorded."""
-# pyright: reportArgumentType=false, reportOperatorIssue=false
 
 from __future__ import annotations
 

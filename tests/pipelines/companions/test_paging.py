@@ -1,5 +1,4 @@
 """A map with room for a part of the long wall, whose other parts lie on disk."""
-# pyright: reportOptionalMemberAccess=false
 
 from __future__ import annotations
 
@@ -262,7 +261,7 @@ def test_views_are_of_the_present_place_only_once_there_are_others_or_parts_of_t
         T = np.eye(4)
         T[0, 3] = -5.0 * index
         store.append(replace(frame(index, 0.0), T_camera_world=T))
-    paging = Paging(None, store, None, MappingSettings())  # pyright: ignore[reportArgumentType]
+    paging = Paging(None, store, None, MappingSettings())
     paging.most_missing = 10
     assert paging.near().tolist() == [0, 1, 2, 3, 4, 5]
     store.begins.add(4)

@@ -1,5 +1,4 @@
 """Views of a textured wall, rendered analytically: what moves, what the map lacks, ghosts, and the masks."""
-# pyright: reportArgumentType=false, reportCallIssue=false, reportOperatorIssue=false
 
 from __future__ import annotations
 

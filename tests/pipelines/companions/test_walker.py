@@ -1,5 +1,4 @@
 """Something walks past the wall while it is mapped. The wall without it is known."""
-# pyright: reportArgumentType=false
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
 """Seeds of new Gaussians, how they grow, what a wrong depth costs, and the first points of the offline baseline."""
-# pyright: reportAssignmentType=false
 
 from __future__ import annotations
 

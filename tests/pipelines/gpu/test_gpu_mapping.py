@@ -1,5 +1,4 @@
 """Optimisation on the GPU leads where it leads on the CPU."""
-# pyright: reportArgumentType=false, reportOptionalMemberAccess=false, reportReturnType=false
 
 from __future__ import annotations
 

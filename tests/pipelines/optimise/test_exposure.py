@@ -1,5 +1,4 @@
 """Exposure: the way back from an image to the scene's colours, the fit, the pull, and a whole run of changing light."""
-# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false, reportOptionalOperand=false
 
 from __future__ import annotations
 

@@ -1,5 +1,3 @@
-# pyright: reportArgumentType=false
-
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator

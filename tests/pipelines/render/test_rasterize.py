@@ -1,5 +1,4 @@
 """`rasterize` against the plain renderer, against finite differences, and as the renderer of a training loop."""
-# pyright: reportArgumentType=false, reportCallIssue=false
 
 from __future__ import annotations
 

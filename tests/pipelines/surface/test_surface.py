@@ -1,5 +1,4 @@
 """The surface of a finished map: agreement, matching and planes, against plain projections."""
-# pyright: reportIndexIssue=false
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
 """A run that was stopped goes on as if it had not been: real processes, killed and interrupted, and real files."""
-# pyright: reportOptionalMemberAccess=false
 
 from __future__ import annotations
 

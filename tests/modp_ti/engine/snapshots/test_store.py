@@ -1,5 +1,4 @@
 """Copies of snapshots: the further one is taken, and a storage that fails costs one line."""
-# pyright: reportOptionalMemberAccess=false
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
 """`KltTracker` over files: what it delivers, corrects, says and refuses."""
-# pyright: reportArgumentType=false, reportAttributeAccessIssue=false
-# pyright: reportCallIssue=false, reportOptionalMemberAccess=false
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
 """A live source delivers frames as they come, can be read again, keeps what nobody takes, and lets go at its end."""
-# pyright: reportOptionalMemberAccess=false, reportOptionalSubscript=false
 
 from __future__ import annotations
 

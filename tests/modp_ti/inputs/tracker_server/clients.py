@@ -1,5 +1,4 @@
 """A server with somebody before it: connections that send bytes written out by hand."""
-# pyright: reportArgumentType=false
 
 from __future__ import annotations
 

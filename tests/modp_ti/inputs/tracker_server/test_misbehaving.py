@@ -1,5 +1,4 @@
 """Peers in other processes that misbehave cost one note, a bounded amount of everything, and never the next tracker."""
-# pyright: reportOptionalMemberAccess=false
 
 from __future__ import annotations
 

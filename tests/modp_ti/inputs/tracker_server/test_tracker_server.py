@@ -1,7 +1,4 @@
 """What comes through the server is what the mapper gets, and where the server is."""
-# pyright: reportArgumentType=false, reportAttributeAccessIssue=false
-# pyright: reportOperatorIssue=false, reportOptionalMemberAccess=false
-# pyright: reportOptionalSubscript=false
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
 """What one process writes to a slot is what the other reads, and nothing is left when both are done."""
-# pyright: reportPossiblyUnboundVariable=false
 
 from __future__ import annotations
 

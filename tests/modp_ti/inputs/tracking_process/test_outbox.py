@@ -1,5 +1,4 @@
 """Frames wait for the mapper in order, most of them without their images, and do not hold up the tracker."""
-# pyright: reportAttributeAccessIssue=false
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
 """The tracker in a process of its own delivers what it delivers in this one, waits for nobody, and may die."""
-# pyright: reportArgumentType=false, reportOperatorIssue=false
-# pyright: reportOptionalMemberAccess=false, reportOptionalSubscript=false
 
 from __future__ import annotations
 

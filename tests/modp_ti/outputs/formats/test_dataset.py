@@ -1,5 +1,4 @@
 """A run's COLMAP model says what the run knows: read back by pycolmap, and by our own reader as input of a new run."""
-# pyright: reportOptionalOperand=false
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
 """Fused depth is the surface that it shows, and mesh files hold it for other programs."""
-# pyright: reportArgumentType=false
 
 from __future__ import annotations
 

@@ -2,7 +2,6 @@
 
 `tests/modp_ti/test_written_and_read.py` has the round trips of frames, scores and trajectories.
 """
-# pyright: reportCallIssue=false
 
 from __future__ import annotations
 

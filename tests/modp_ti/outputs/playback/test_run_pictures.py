@@ -1,5 +1,4 @@
 """The pictures and frames of finished runs, read again in their order."""
-# pyright: reportPossiblyUnboundVariable=false
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
 """A run that never was, with figures that are known, for the page to show."""
-# pyright: reportArgumentType=false, reportIncompatibleMethodOverride=false, reportReturnType=false
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
 """`report.html`: one file that loads nothing, whose figures, curves and pictures are those of the run."""
-# pyright: reportOperatorIssue=false, reportOptionalMemberAccess=false, reportOptionalSubscript=false
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
 """Frames, renders and error maps, against what is computed pixel by pixel."""
-# pyright: reportArgumentType=false, reportOptionalMemberAccess=false, reportOptionalSubscript=false
 
 from __future__ import annotations
 

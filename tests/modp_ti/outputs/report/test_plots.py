@@ -1,5 +1,4 @@
 """The numbers behind the drawings, computed another way, and the view from above of worlds whose up is known."""
-# pyright: reportCallIssue=false
 
 from __future__ import annotations
 

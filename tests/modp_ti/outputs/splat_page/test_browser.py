@@ -1,5 +1,4 @@
 """Exported pages in a real browser: from the disk and without network, and streamed from a server."""
-# pyright: reportArgumentType=false, reportMissingImports=false, reportOptionalSubscript=false
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
 """The page's frame: what is upright, the moved map, and the flight."""
-# pyright: reportArgumentType=false, reportCallIssue=false
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
 """The page of a finished map: what a browser gets from where a frame was taken, and how the command fails."""
-# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportOptionalSubscript=false
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
 """The hand-over between the mapping thread and the viewer: bounded, the latest wins, its cost stays below a share."""
-# pyright: reportOptionalMemberAccess=false
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
 """What the page shows: splats against SciPy, the browser's camera, and errors that are known."""
-# pyright: reportArgumentType=false, reportGeneralTypeIssues=false
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
 """The page as it is served: to whom, what it says where it cannot be, and to browsers that do not listen."""
-# pyright: reportArgumentType=false, reportOperatorIssue=false
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
 """Depth by Gaussian processes and from the map, and the fusion of both."""
-# pyright: reportArgumentType=false, reportAttributeAccessIssue=false
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
 """DepthCov: its depth, its network and its checkpoint."""
-# pyright: reportArgumentType=false, reportAssignmentType=false, reportReturnType=false
 
 from __future__ import annotations
 

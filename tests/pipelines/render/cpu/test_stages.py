@@ -1,5 +1,4 @@
 """The stages on the CPU against plain twins: binning, the photometric model, and the fast power of two."""
-# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false, reportReturnType=false
 
 from __future__ import annotations
 
