@@ -23,8 +23,6 @@ from pipelines.densify.densifier import Densifier
 from pipelines.render.spherical_harmonics import sh_rotation
 from pipelines.settings import CorrectionSettings
 
-__all__ = ["CorrectionReport", "MapCorrector", "WorldMotion", "motion_in_pixels", "revise"]
-
 NO_MOTION = np.eye(4)
 # Minimum number of moved points to estimate a keyframe's change of scale.
 MIN_POINTS = 10

@@ -11,8 +11,6 @@ from fields.map.keyframes import KeyframeStore
 from fields.voxels.occupancy import OccupancyVoxels
 from pipelines.optimise.safeguards import Safeguards
 
-__all__ = ["OBSERVATION", "MemoryBudget"]
-
 # Bytes of an observation: the id of the point and its pixel.
 OBSERVATION = 12
 

@@ -28,8 +28,6 @@ from pipelines.refinement import decay
 from pipelines.render.renderer import Renderer
 from pipelines.stopwatch import Stopwatch
 
-__all__ = ["OfflineMapper", "Schedule", "scene_extent"]
-
 # Length of the published run, to which the step numbers in the settings refer.
 PUBLISHED_STEPS = 30_000
 # Density control starts once the map resembles the scene, which takes the same number of steps in a short run. Its

@@ -7,8 +7,6 @@ from pydantic import Field, field_validator
 from fields.runtime.engine import engine
 from pipelines.settings import StrictModel
 
-__all__ = ["OfflineSettings"]
-
 
 class OfflineSettings(StrictModel):
     """Offline 3DGS [Kerbl 2023], the baseline: optimisation on all frames, starting from the tracked points.

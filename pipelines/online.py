@@ -39,8 +39,6 @@ from pipelines.settings import MappingSettings
 from pipelines.stopwatch import Stopwatch
 from pipelines.warm_up import warm_up
 
-__all__ = ["OnlineMapper"]
-
 
 @in_engine("compile", "process", "optimise", "optimise_further", "correct", "finish")
 @in_engine("prune", "all_gaussians", "begin_passes", "caught")

@@ -21,8 +21,6 @@ from pipelines.optimise.safeguards import Safeguards
 from pipelines.render.renderer import Renderer
 from pipelines.stopwatch import Stopwatch
 
-__all__ = ["FrameReport", "NothingToMapError", "Pipeline"]
-
 
 class NothingToMapError(ValueError):
     """Raised if the frames contain nothing that a map could be built from."""

@@ -16,8 +16,6 @@ from pipelines.settings import RefineSettings
 if TYPE_CHECKING:
     from pipelines.online import OnlineMapper
 
-__all__ = ["Schedule", "decay", "finish", "in_seconds", "in_steps", "refine"]
-
 # Factor on all rates at the end of `finish`. 0.2 and 0.1 differ by less than 0.1 dB on five recordings; 1 is 0.4 to
 # 1.0 dB worse.
 LAST_RATE = 0.2

@@ -16,25 +16,6 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 from fields.frames.pyramid import MAX_LEVELS
 from fields.runtime.engine import engine
 
-__all__ = [
-    "CorrectionSettings",
-    "DensifySettings",
-    "DepthSettings",
-    "EpipolarSettings",
-    "ExposureSettings",
-    "GateSettings",
-    "KeyframeSettings",
-    "LevelSettings",
-    "MappingSettings",
-    "OptimiseSettings",
-    "PoseSettings",
-    "RefineSettings",
-    "StrictModel",
-    "ViewSettings",
-    "VoxelSettings",
-]
-
-
 # Views that a map of a few keyframes gets after the last frame.
 LAST_VIEWS = 48
 

@@ -15,8 +15,6 @@ from fields.map.keyframe_state import KeyframeRows, keyframe_arrays
 from pipelines.densify.densifier import Anchor
 from pipelines.online import OnlineMapper
 
-__all__ = ["MapState", "restore_state", "save_state"]
-
 # Number of keyframes whose images go to disk together, in one file, while they are read again.
 STORED_TOGETHER = 16
 

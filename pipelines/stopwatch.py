@@ -6,8 +6,6 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 
-__all__ = ["Stopwatch", "breakdown_percent"]
-
 # The stages of the paper's breakdown: Optim, Cam Select, Depth Est., MOHV.
 BREAKDOWN = ("optimise", "select", "depth", "occupancy")
 

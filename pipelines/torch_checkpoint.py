@@ -10,8 +10,6 @@ from pathlib import Path
 
 import torch
 
-__all__ = ["read_checkpoint", "require_entries"]
-
 # Files from before PyTorch 1.6 are consecutive pickles: this number, then version, system information and content.
 MAGIC = 0x1950A86A20F9469CFC6C
 PICKLES = 4

@@ -15,8 +15,6 @@ from pipelines.render.cpu.photometric_model import IDENTITY
 if TYPE_CHECKING:
     from pipelines.online import OnlineMapper
 
-__all__ = ["warm_up"]
-
 
 def warm_up(mapper: OnlineMapper) -> None:
     """Run every kernel of an empty map once, on two views of four Gaussians, and leave the map empty."""

@@ -11,8 +11,6 @@ from modp_ti.commands.shared import BAD_INPUT, FAULT
 from modp_ti.files.ending_signals import EndingSignals, exit_code
 from modp_ti.files.errors import InputError
 
-__all__ = ["documented_ending"]
-
 
 @contextmanager
 def documented_ending(*refusals: type[Exception]) -> Iterator[None]:

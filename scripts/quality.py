@@ -18,8 +18,6 @@ from tables import Figures, mapping_seconds, markdown_table
 
 from modp_ti.files.errors import InputError
 
-__all__ = ["Curves", "Point", "against", "curves", "plot", "report", "this_program"]
-
 ROOT = Path(__file__).resolve().parents[1]
 # Refinement steps per step of a keyframe, as in the default settings (1000 and 25).
 REFINED = 40

@@ -24,8 +24,6 @@ from pipelines.render.compositing_reference import ReferenceCompositing
 from pipelines.render.renderer import Renderer
 from pipelines.settings import MappingSettings
 
-__all__ = ["ADAM_BYTES", "SIZES", "STAGES", "Size", "add_gaussians", "camera_of", "measure_machine", "measure_step"]
-
 STAGES = (
     "projection", "binning", "compositing", "loss", "compositing backward", "projection backward", "penalty", "Adam",
 )  # fmt: skip

@@ -24,17 +24,6 @@ from modp_ti.many.pool import LocalPool
 from modp_ti.many.scenes import Scene, for_a_task
 from modp_ti.outputs.formats.run_files import read_scores
 
-__all__ = [
-    "Figures",
-    "command_line",
-    "execute",
-    "mapping_seconds",
-    "markdown_table",
-    "named_scenes",
-    "settings_of",
-    "write_report",
-]
-
 # Figures of one table row by name; None if a run does not have the figure.
 Figures = Mapping[str, float | None]
 # Stages of metrics.json that are not mapping and do not depend on the method.

@@ -16,8 +16,6 @@ from scipy.spatial.transform import Rotation
 
 from tests.captures import View
 
-__all__ = ["BODY_CAMERA", "FORMS", "OPTICAL", "Messages", "recording", "write_bag"]
-
 # T_link_optical: from a camera's axes in ROS's optical frame to those of a body (x forward, y left, z up).
 OPTICAL = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 # T_base_link, of the camera's body on the robot.

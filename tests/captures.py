@@ -14,8 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-__all__ = ["DEPTH_SIZE", "KITTI_OFFSET", "MOUNT", "OPENGL", "WRITERS", "View", "exr_file", "lzfse_stored", "zipped"]
-
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 # T_body_camera of the sequences in EuRoC's layout.
 MOUNT = np.eye(4)

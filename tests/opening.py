@@ -14,8 +14,6 @@ from modp_ti.inputs.reader import TrackerSettings
 from modp_ti.inputs.readers import READERS, SOURCES
 from modp_ti.inputs.replay import ReplayedTracker
 
-__all__ = ["CAPTURES", "opened_with", "read_capture"]
-
 CAPTURES = {kind: reader for kind, reader in READERS.items() if issubclass(reader, CaptureSettings)}
 
 

@@ -1,6 +1,4 @@
 """How long a test waits for a process, a thread or a connection before it is taken to hang."""
 
-__all__ = ["PATIENCE"]
-
 # Minutes [s]: whether a test passes must not depend on the speed of the machine, or on what runs beside it.
 PATIENCE = 1200.0

@@ -29,8 +29,6 @@ from numpy.typing import NDArray
 
 from fields.runtime.engine import engine
 
-__all__ = ["disturbance", "disturbed"]
-
 # Required distance between a bound and the worst draw, in units of the spread.
 MARGIN = 1.0
 NUMBER = r"(?:np\.\w+\()?(-?(?:\d+\.?\d*(?:e[+-]?\d+)?|inf))\)?"

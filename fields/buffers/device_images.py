@@ -8,8 +8,6 @@ import torch
 
 from fields.runtime.backend import torch_device
 
-__all__ = ["DeviceImages"]
-
 
 class DeviceImages:
     """Cache of device copies of keyframe images, which stay in host memory.

@@ -5,8 +5,6 @@ import torch
 from fields.runtime.backend import torch_device
 from fields.runtime.engine import ti
 
-__all__ = ["NO_TILE", "TILE_HEIGHT", "TILE_PIXELS", "TILE_WIDTH", "DevicePairs", "tile_count"]
-
 # One thread per pixel. Square tiles keep the number of pairs low; the CPU's tiles are narrow for its vector units.
 TILE_WIDTH = TILE_HEIGHT = 16
 TILE_PIXELS = TILE_WIDTH * TILE_HEIGHT

@@ -11,8 +11,6 @@ from fields.runtime.compiled_kernel import CompiledLoop
 from fields.runtime.engine import ti
 from fields.runtime.parallel import HANDED_OUT
 
-__all__ = ["PAD", "SCRATCH_ROWS", "STRIPS", "ImageBuffers"]
-
 # Border of zeros around every plane [px]. An 11x11 window reads 5 px beyond the image without a branch.
 PAD = 8
 # The loss works on strips of rows in parallel, with separate scratch rows for each channel of a strip.

@@ -3,8 +3,6 @@
 from fields.runtime.backend import growing, on_gpu
 from fields.runtime.engine import ti
 
-__all__ = ["ProjectedGaussians"]
-
 BLOCK = 1024
 
 

@@ -6,8 +6,6 @@ import numpy as np
 from fields.runtime.backend import sparse
 from fields.runtime.engine import ti
 
-__all__ = ["GROUP", "TILE_HEIGHT", "TILE_PIXELS", "TILE_WIDTH", "TilePairs"]
-
 # Powers of two. A row of a tile is one vector of eight float32, the width that LLVM uses even where the processor has
 # wider vectors. Pixels of a row outside the ellipse are wasted work. Rows outside it are skipped, so that tall tiles
 # waste nothing and keep the number of pairs low.

@@ -9,8 +9,6 @@ from fields.runtime.backend import without_waiting
 from fields.runtime.compiled_kernel import CompiledKernel
 from fields.runtime.engine import ti
 
-__all__ = ["ViewField"]
-
 # Projection is linearised up to this fraction of half the image outside the frame (1.3 tan(fov / 2), as in 3DGS).
 FRUSTUM_MARGIN = 0.3
 

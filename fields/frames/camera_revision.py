@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 
 from fields.geometry.camera import PinholeCamera
 
-__all__ = ["CameraRevision"]
-
 # Steps of the fixed-point iteration that inverts the lookup. Each divides the error by two or more for usual lenses.
 INVERSION_STEPS = 12
 

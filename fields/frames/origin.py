@@ -12,8 +12,6 @@ from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from fields.geometry.se3 import camera_centres
 
-__all__ = ["NO_ORIGIN", "far_centre", "far_origin", "shifted", "shifted_poses"]
-
 NO_ORIGIN = np.zeros(3)
 
 Event = TypeVar("Event", TrackedFrame, PoseCorrection)

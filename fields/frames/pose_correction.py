@@ -10,8 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from fields.frames.camera_revision import CameraRevision
 
-__all__ = ["PoseCorrection"]
-
 
 @dataclass(frozen=True)
 class PoseCorrection:

@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 
 from fields.geometry.camera import PinholeCamera
 
-__all__ = ["MAX_LEVELS", "ImageLevel", "build_pyramid"]
-
 # Even the largest images are thumbnails after this many levels.
 MAX_LEVELS = 8
 

@@ -13,8 +13,6 @@ from fields.frames.camera_revision import CameraRevision
 from fields.frames.pyramid import ImageLevel, build_pyramid
 from fields.geometry.camera import PinholeCamera
 
-__all__ = ["SparsePoints", "TrackedFrame"]
-
 # Largest deviation of a pose's entries from a rigid motion.
 MAX_DRIFT = 1e-3
 # Generated ids start at index * IDS_PER_FRAME, so that the ids of different frames never coincide.

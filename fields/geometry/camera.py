@@ -8,8 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["PinholeCamera"]
-
 
 def _number(value: float) -> float:
     """The value as a float; NaN if it is no number."""

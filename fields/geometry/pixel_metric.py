@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from fields.geometry.camera import PinholeCamera
 
-__all__ = ["pixel_jacobian", "pixel_metric"]
-
 # Depths at which the metric samples a view [median depths].
 NEAR_AND_FAR = (0.6, 1.6)
 

@@ -15,22 +15,6 @@ from numpy.typing import ArrayLike, NDArray
 if TYPE_CHECKING:
     import torch
 
-__all__ = [
-    "camera_centres",
-    "exp_se3",
-    "hat",
-    "interpolate_se3",
-    "inverse_poses",
-    "inverse_se3",
-    "log_se3",
-    "matrices_from_unit_quaternions",
-    "matrix_from_quaternion",
-    "orthonormalised",
-    "quaternion_from_matrix",
-    "quaternions_from_matrices",
-    "torch_exp_se3",
-]
-
 # Below this angle [rad], the closed forms lose precision and their series are exact to rounding.
 SMALL_ANGLE = 1e-4
 IDENTITY = np.eye(3)

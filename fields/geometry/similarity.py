@@ -10,8 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from fields.geometry.se3 import inverse_se3, orthonormalised
 
-__all__ = ["motion_around", "moved_points", "moved_pose", "scale_of"]
-
 
 def scale_of(S: ArrayLike) -> NDArray[np.float64]:
     """Scale s of a similarity (4, 4), or scales (N,) of N similarities (N, 4, 4)."""

@@ -6,8 +6,6 @@ such a variable on a stack, which made the gradient of the projection three time
 
 from fields.runtime.engine import ti
 
-__all__ = ["cross", "dot", "rotate", "rotate_back", "rotation_from_quaternion"]
-
 
 @ti.func
 def dot(a, b):

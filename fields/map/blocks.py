@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 
 from fields.geometry.camera import PinholeCamera
 
-__all__ = ["Blocks", "Boxes", "box_of", "divide", "extent_of", "planes_of", "seen"]
-
 # Coordinates of cubes are clipped to this, so that they fit into 32 bits.
 FARTHEST = float(2**31 - 1)
 # Size of a sphere over the smallest side beyond which cubes do not grow further.

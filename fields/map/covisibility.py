@@ -11,8 +11,6 @@ from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from fields.map.keyframe import Keyframe
 
-__all__ = ["SeenPoints", "covisibility"]
-
 
 @dataclass(frozen=True)
 class SeenPoints:

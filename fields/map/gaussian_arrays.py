@@ -3,8 +3,6 @@
 
 from fields.runtime.engine import ti
 
-__all__ = ["read_numbers", "read_values", "write_integers", "write_reals", "write_values"]
-
 
 @ti.kernel
 def read_values(

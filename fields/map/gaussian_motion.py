@@ -9,8 +9,6 @@ from fields.geometry.similarity import scale_of
 from fields.map.gaussians import GaussianField
 from fields.runtime.engine import ti
 
-__all__ = ["GaussianMotion"]
-
 TABLE = ti.types.ndarray(ndim=2)
 BLOCKS = ti.types.ndarray(ndim=3)
 

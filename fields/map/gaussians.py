@@ -12,8 +12,6 @@ from fields.runtime.backend import growing, on_gpu, place, refuse_too_many_field
 from fields.runtime.engine import ti
 from fields.runtime.tenancy import in_engine, settled
 
-__all__ = ["NO_ANCHOR", "SH_C0", "GaussianField"]
-
 # The constant spherical harmonic: colour = 0.5 + SH_C0 * sh[0].
 SH_C0 = 0.28209479177387814
 BLOCK = 1024

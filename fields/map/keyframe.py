@@ -17,8 +17,6 @@ from fields.geometry.se3 import inverse_se3, orthonormalised
 from fields.geometry.similarity import moved_points, scale_of
 from fields.map.trajectory import Trajectory
 
-__all__ = ["Keyframe", "median_depth_of", "nbytes_of"]
-
 
 @dataclass(slots=True)
 class Keyframe:

@@ -11,8 +11,6 @@ from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from fields.map.keyframe import Keyframe
 from fields.map.keyframes import KeyframeStore
 
-__all__ = ["KeyframeRows", "keyframe_arrays"]
-
 # Scalars and small matrices of a `Keyframe`, with their shapes.
 NUMBERS: dict[str, tuple[int, ...]] = {
     "index": (),

@@ -15,8 +15,6 @@ from fields.geometry.se3 import camera_centres, interpolate_se3
 from fields.map.keyframe import Keyframe, median_depth_of, nbytes_of
 from fields.map.trajectory import Trajectory
 
-__all__ = ["FAR", "KeyframeStore", "RunningMedian", "centres_of"]
-
 # Distance beyond which a keyframe is of another place [scene depths].
 FAR = 3.0
 

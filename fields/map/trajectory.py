@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from fields.frames.tracked_frame import TrackedFrame
 
-__all__ = ["Trajectory"]
-
 
 class Trajectory(Mapping[int, NDArray[np.float64]]):
     """Tracked poses T_camera_world (4, 4) by frame index, with all corrections of the tracker so far.

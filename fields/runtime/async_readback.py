@@ -5,8 +5,6 @@ from typing import ClassVar
 import numpy as np
 import torch
 
-__all__ = ["AsyncReadback"]
-
 
 class AsyncReadback:
     """A snapshot of a small tensor that is read later.

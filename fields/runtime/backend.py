@@ -18,24 +18,6 @@ from fields.runtime.kernel_sources import answer_quickly
 from fields.runtime.process import pin_workers, threads_of_process
 from fields.runtime.vulkan_devices import VulkanDevice, choose, vulkan_devices
 
-__all__ = [
-    "describe",
-    "growing",
-    "has_sparse_fields",
-    "initialise",
-    "on_gpu",
-    "place",
-    "program",
-    "refuse_too_many_fields",
-    "restart",
-    "running_backend",
-    "sparse",
-    "sparse_nodes",
-    "too_many",
-    "torch_device",
-    "without_waiting",
-]
-
 answer_quickly()  # at import, since most of the time that it saves goes into the definitions of kernels
 
 MAX_SNODES = engine().max_snodes

@@ -10,8 +10,6 @@ import torch
 from fields.runtime.backend import on_gpu
 from fields.runtime.engine import compiled_kernel, engine, owner_of_kernel, running_program
 
-__all__ = ["CompiledKernel", "CompiledLoop"]
-
 # Below this much work [ns], waking a second thread costs more than it saves. Waking a thread took 50 us on one machine
 # and 180 us on another, a virtual one.
 ALONE_BELOW = 300_000.0

@@ -5,8 +5,6 @@ import numpy as np
 
 from fields.runtime.engine import ti
 
-__all__ = ["computes_rightly"]
-
 BLOCK = 64
 VALUES = ti.types.ndarray(dtype=ti.i32, ndim=1)
 

@@ -19,8 +19,6 @@ from typing import Any
 
 from fields.runtime.engine import engine, part
 
-__all__ = ["answer_quickly"]
-
 # Functions that look up a source, under the names that the engine's modules import them.
 READERS = ("getsourcelines", "getsourcefile", "get_source_info_and_src")
 

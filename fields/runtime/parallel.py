@@ -12,8 +12,6 @@ with SPREAD = HANDED_OUT // (number of tasks per chunk). The empty iterations co
 
 import os
 
-__all__ = ["HANDED_OUT", "available_cores"]
-
 HANDED_OUT = 512
 
 

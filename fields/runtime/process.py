@@ -16,17 +16,6 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = [
-    "give_back_heap",
-    "give_back_pages",
-    "has_room",
-    "notes",
-    "pin_workers",
-    "provide_cache",
-    "threads_of_process",
-    "why_too_narrow",
-]
-
 # Disk space that stays free [bytes].
 KEPT_FREE = 1 << 30
 

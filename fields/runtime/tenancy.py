@@ -21,8 +21,6 @@ from fields.runtime.backend import (
 )
 from fields.runtime.engine import engine, forget_unfinished, lock, running_program
 
-__all__ = ["Tenancy", "Tenant", "empty", "ensure_started", "in_engine", "settled"]
-
 T = TypeVar("T")
 
 # Sparse SNodes after which the engine is started again as soon as nobody has fields: their memory is not given back

@@ -8,8 +8,6 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-__all__ = ["VulkanDevice", "choose", "vulkan_devices"]
-
 LIBRARY = "vulkan-1.dll" if sys.platform == "win32" else "libvulkan.so.1"
 # VkPhysicalDeviceType. Software drivers are of type 4, a CPU.
 INTEGRATED, DISCRETE = 1, 2

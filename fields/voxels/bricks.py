@@ -16,21 +16,6 @@ from numpy.typing import NDArray
 
 from fields.runtime.engine import ti
 
-__all__ = [
-    "BRICKS",
-    "BRICK_BYTES",
-    "BRICK_LEVELS",
-    "SIDE",
-    "WORDS",
-    "Bricks",
-    "corner_of",
-    "depth_reached",
-    "numbered",
-    "place_of",
-    "places_of_marks",
-    "without_repetitions",
-]
-
 BRICK_LEVELS = 3
 BRICK = 2**BRICK_LEVELS
 FIRST_WORD = (0, 8, 9)

@@ -7,8 +7,6 @@ from numpy.typing import NDArray
 from fields.runtime.engine import dense_array, ti
 from fields.voxels.bricks import WORDS, Bricks, depth_reached, numbered, place_of, places_of_marks, without_repetitions
 
-__all__ = ["HashedBricks"]
-
 # Number of bricks that there is room for at first.
 FIRST_ROOM = 1 << 12
 # Number of bricks that one launch inserts: drivers end a launch that takes seconds, and one thread inserts them all.

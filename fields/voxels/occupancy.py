@@ -12,8 +12,6 @@ from fields.voxels.hashed_bricks import HashedBricks
 from fields.voxels.resting_bricks import RESTING_BYTES, RestingBricks
 from fields.voxels.sparse_bricks import SparseBricks
 
-__all__ = ["OccupancyVoxels"]
-
 MAX_LEVELS = 15
 # Cell indices are clipped to this before the conversion to integers. It is out of range at every level.
 FARTHEST = 2.0**31 - 1.0

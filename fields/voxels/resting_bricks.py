@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from fields.voxels.bricks import Bricks, places_of_marks
 
-__all__ = ["RESTING_BYTES", "RestingBricks"]
-
 # Bytes that a word takes while it rests, rounded up: its place and the word itself are 24 bytes before they are packed.
 RESTING_BYTES = 8
 WORD_BYTES = 24

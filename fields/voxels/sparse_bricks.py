@@ -17,8 +17,6 @@ from fields.voxels.bricks import (
     without_repetitions,
 )
 
-__all__ = ["SparseBricks"]
-
 # Fan-outs per axis of the pointer levels above the bricks. They are small at the bottom, where most of a node around a
 # surface is empty.
 POINTERS = (32, 4, 4, 4, 4, 2, 2, 2)

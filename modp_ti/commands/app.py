@@ -11,8 +11,6 @@ from modp_ti.commands import batch, cameras, check, finished, run, warmup
 from modp_ti.commands.shared import BAD_INPUT, MARKUP, CommandGroup, examples
 from modp_ti.version import __version__
 
-__all__ = ["app"]
-
 OVERVIEW = examples(
     "modp-ti check scene.yaml   (is the input as it should be?)",
     "modp-ti run scene.yaml   (the map, its poses, figures and report.html)",

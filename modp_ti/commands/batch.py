@@ -21,8 +21,6 @@ from modp_ti.commands.shared import (
     progress_console,
 )
 
-__all__ = ["EXAMPLES", "batch"]
-
 EXAMPLES = examples(
     "modp-ti batch */scene.yaml   (again: resumes what is not finished)",
     "modp-ti batch videos/*.mp4 --fast --jobs 2   (to out/NAME, as modp-ti run)",

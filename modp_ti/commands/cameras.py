@@ -10,8 +10,6 @@ from modp_ti.commands.shared import AsJson, Quiet, examples, one_line, outcome, 
 if TYPE_CHECKING:
     from modp_ti.inputs.sources.cameras import Camera
 
-__all__ = ["EXAMPLES", "cameras"]
-
 EXAMPLES = examples("modp-ti cameras", "modp-ti cameras --json")
 
 NONE = "no camera found; a stream can be named by its address: modp-ti run --stream rtsp://HOST/PATH"

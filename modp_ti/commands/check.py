@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from modp_ti.config.settings import SceneConfig
     from modp_ti.inputs.protocol import Tracker
 
-__all__ = ["EXAMPLES", "check", "inspect_scene"]
-
 EXAMPLES = examples(
     "modp-ti check scene.yaml",
     "modp-ti check scene.yaml --quiet && modp-ti run scene.yaml",

@@ -27,8 +27,6 @@ from modp_ti.files.errors import InputError
 if TYPE_CHECKING:
     from modp_ti.outputs.locating.locator import Location
 
-__all__ = ["EXAMPLES", "export", "locate", "refine", "render", "view"]
-
 EXAMPLES = {
     "render": examples(
         "modp-ti render out/room   (the recorded path, out/room/recorded.mp4)",

@@ -23,8 +23,6 @@ from modp_ti.commands.shared import (
 )
 from modp_ti.files.errors import InputError
 
-__all__ = ["EXAMPLES", "run"]
-
 EXAMPLES = examples(
     "modp-ti run scene.yaml",
     "modp-ti run scene.yaml --fast   (a first look; --best for a map to keep)",

@@ -28,30 +28,6 @@ from modp_ti.files.urls import without_secrets
 if TYPE_CHECKING:
     from rich.console import Console
 
-__all__ = [
-    "BAD_INPUT",
-    "MARKUP",
-    "Address",
-    "AsJson",
-    "Best",
-    "CommandGroup",
-    "Device",
-    "Fast",
-    "OnDevice",
-    "Outcome",
-    "Overrides",
-    "Quiet",
-    "Where",
-    "chosen_preset",
-    "examples",
-    "matching_settings",
-    "one_line",
-    "outcome",
-    "picture_size",
-    "progress_console",
-    "standalone",
-]
-
 # Exit codes; docs/commands.md lists all of them. 1 has its own meaning in `check` and `locate`.
 BAD_INPUT, FAULT = 2, 3
 

@@ -24,8 +24,6 @@ from modp_ti.files.errors import InputError
 if TYPE_CHECKING:
     from modp_ti.config.settings import SceneConfig
 
-__all__ = ["EXAMPLES", "compile_size", "warmup"]
-
 EXAMPLES = examples("modp-ti warmup scene.yaml", "modp-ti warmup --size 640x480 --size 1280x720")
 
 

@@ -8,8 +8,6 @@ from modp_ti.config.keys import KeyDoc, as_yaml, documented_keys
 from modp_ti.config.presets import PRESETS
 from modp_ti.config.settings import SceneConfig
 
-__all__ = ["reference"]
-
 INTRODUCTION = """\
 # Settings
 

@@ -8,8 +8,6 @@ from pydantic import Field, model_validator
 
 from pipelines.settings import StrictModel
 
-__all__ = ["BagImagesSettings", "IntrinsicsSettings", "PanoramaSettings", "VrsSettings"]
-
 
 class IntrinsicsSettings(StrictModel):
     """The camera's intrinsics and lens distortion, in pixels of the stored images, turned as EXIF says."""

@@ -12,8 +12,6 @@ from modp_ti.inputs.reader import GivenPosesSettings
 if TYPE_CHECKING:
     from modp_ti.config.settings import SceneConfig
 
-__all__ = ["EXCLUSIONS", "refuse_exclusions", "used_settings"]
-
 # Names of `used_settings` for frames that do not wait, the most telling first, and for a tracker by what it lacks.
 CLOCK = ("source.stream", "source.realtime", "a live tracker", "mapping.pace: realtime")
 TRACKED, RECORDED = "a tracker of images as they come", "a tracker of recordings"

@@ -16,18 +16,6 @@ from pydantic.fields import FieldInfo
 
 from modp_ti.files.urls import shown_url
 
-__all__ = [
-    "KeyDoc",
-    "as_yaml",
-    "differing_keys",
-    "documented_keys",
-    "documented_values",
-    "dotted_keys",
-    "leaves",
-    "suggestion",
-    "variants_of",
-]
-
 TYPE_NAMES = {int: "integer", float: "number", str: "text", bool: "true or false", Path: "path", NoneType: "empty"}
 
 

@@ -8,8 +8,6 @@ from pydantic import Field, model_validator
 
 from pipelines.settings import StrictModel
 
-__all__ = ["EvaluationSettings", "ExportSettings", "ViewSettings"]
-
 
 class EvaluationSettings(StrictModel):
     """The evaluation of the finished map."""

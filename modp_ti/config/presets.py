@@ -6,8 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-__all__ = ["PRESETS", "Preset", "with_defaults"]
-
 
 @dataclass(frozen=True)
 class Preset:

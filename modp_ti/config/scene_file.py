@@ -24,8 +24,6 @@ from modp_ti.files.terminal import require_text
 from modp_ti.files.urls import FROM_FILE, shown_url
 from modp_ti.files.yaml_text import parse_yaml
 
-__all__ = ["dump_scene", "load_scene", "scene_from_data"]
-
 M = TypeVar("M", bound=BaseModel)
 
 # Limits of common file systems: bytes of a name and of a path.

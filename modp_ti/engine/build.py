@@ -21,8 +21,6 @@ from modp_ti.inputs.replay import ALL_HELD_OUT
 from modp_ti.outputs.progress import ProgressLine
 from pipelines.companions.pace import CompletePace, Pace
 
-__all__ = ["EXPECTED", "build_mapper", "open_conductor", "open_earlier_map", "open_observer"]
-
 # The camera that the mapper of a realtime run is made for before the stream has opened. The images of most are smaller:
 # `source.scale: auto` makes none of them larger than 480 pixels.
 EXPECTED = PinholeCamera(640.0, 640.0, 320.0, 320.0, 640, 640)

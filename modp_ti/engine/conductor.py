@@ -20,8 +20,6 @@ from pipelines.pipeline import FrameReport
 from pipelines.refinement import Schedule, in_seconds
 from pipelines.settings import RefineSettings
 
-__all__ = ["Conductor", "first_frame", "fitting"]
-
 
 def first_frame(arriving: FramesAhead[Event]) -> TrackedFrame:
     """Wait for the first frame and return it; it stays the next one of `arriving`.

@@ -12,8 +12,6 @@ from modp_ti.engine.snapshots.snapshot import StreamDigest
 from modp_ti.inputs.protocol import Tracker
 from pipelines.settings import RefineSettings
 
-__all__ = ["EarlierMap"]
-
 
 class EarlierMap:
     """The map that a run starts with: an empty one here; subclasses start with that of finished runs."""

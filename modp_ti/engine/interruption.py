@@ -7,8 +7,6 @@ from contextlib import contextmanager
 
 from modp_ti.files.ending_signals import EndingSignals
 
-__all__ = ["Interruption", "RunStopped"]
-
 
 class RunStopped(Exception):  # noqa: N818 - it is no error
     """The user pressed Ctrl-C, and the run stopped between two steps with a consistent map."""

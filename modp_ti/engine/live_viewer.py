@@ -23,8 +23,6 @@ from modp_ti.outputs.viewer.page import Page, ShownFrame
 from pipelines.pipeline import FrameReport
 from pipelines.render.renderer import RenderedView
 
-__all__ = ["LiveViewer"]
-
 # Fraction of the allowed cost that is budgeted. The rest covers what is not measured: contention for the GIL and for
 # the caches between the viewer's threads and the mapper.
 PLANNED = 0.7

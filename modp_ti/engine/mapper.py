@@ -37,8 +37,6 @@ from pipelines.state import MapState, restore_state, save_state
 from pipelines.whole.finished_map import FinishedMap, go_on
 from pipelines.whole.merge import MappedPart, merge
 
-__all__ = ["Mapper"]
-
 
 @in_engine(
     "add", "take", "optimise_further", "correct", "finish", "refine", "restore", "go_on_with", "watch_changes", "merge"

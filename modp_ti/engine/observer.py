@@ -7,8 +7,6 @@ from modp_ti.engine.mapper import Mapper
 from modp_ti.outputs.progress import LiveStatus
 from pipelines.pipeline import FrameReport
 
-__all__ = ["Observer"]
-
 
 class Observer:
     """Receives events of a run, such as finished frames and steps. This base class ignores them.

@@ -10,8 +10,6 @@ from typing import TypeVar
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
 
-__all__ = ["FramesAhead"]
-
 Item = TypeVar("Item", bound=TrackedFrame | PoseCorrection)
 
 

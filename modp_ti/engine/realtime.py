@@ -25,8 +25,6 @@ from pipelines.pipeline import FrameReport
 from pipelines.refinement import Schedule
 from pipelines.settings import MappingSettings, RefineSettings
 
-__all__ = ["RealtimeRun"]
-
 # Time over which the shown rates are taken [s], and number of keyframes over which the shown steps are.
 RECENT, KEYFRAMES = 5.0, 10
 

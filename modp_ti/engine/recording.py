@@ -35,8 +35,6 @@ from pipelines.companions.realtime_pace import RecordedPace
 from pipelines.refinement import Schedule
 from pipelines.settings import MappingSettings, RefineSettings
 
-__all__ = ["FILE", "RecordedSession", "ReplayedRun", "SessionRecorder"]
-
 FILE = "session.zip"
 # Version of the file. Others are refused.
 VERSION = 3

@@ -36,8 +36,6 @@ from pipelines.online import OnlineMapper
 from pipelines.refinement import refine
 from pipelines.whole.finished_map import FinishedMap, go_on
 
-__all__ = ["refine_run"]
-
 # Steps of a refinement, if the run's settings ask for none.
 STEPS = 1000
 STAGE = "refined"

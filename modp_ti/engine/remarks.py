@@ -6,8 +6,6 @@ from pipelines.companions.pace import CompletePace
 from pipelines.online import OnlineMapper
 from pipelines.pipeline import Pipeline
 
-__all__ = ["remarks"]
-
 
 def remarks(pipeline: Pipeline) -> list[str]:
     """Return one-line remarks about a map after its last frame: what was left out, and what a budget took away."""

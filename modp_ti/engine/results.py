@@ -29,8 +29,6 @@ from modp_ti.outputs.formats.splats_ply import check_splats
 from modp_ti.outputs.report.page import Album, ReportedRun, write_report
 from modp_ti.outputs.report.record import RunRecord
 
-__all__ = ["Results", "metrics_of", "summary_of"]
-
 STAGES = ("compile", "read", "track", "select", "depth", "occupancy", "optimise", "refine", "evaluate")
 # Map versions with a key in metrics.json; the value is null if the run did not make that version.
 MAPS = ("online", "refined", "offline")

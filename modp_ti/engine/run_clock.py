@@ -5,8 +5,6 @@ from __future__ import annotations
 import sys
 import time
 
-__all__ = ["RunClock", "peak_memory_mb"]
-
 
 class RunClock:
     """Measures the time of the whole run (`total`) and of its mapping (`mapping`) [s], including earlier processes."""

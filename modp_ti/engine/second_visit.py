@@ -34,8 +34,6 @@ from modp_ti.outputs.progress import ProgressLine
 from pipelines.companions.changes import EarlierVisit
 from pipelines.whole.finished_map import FinishedMap
 
-__all__ = ["SecondVisit"]
-
 # Located frames that settle the place of the recording.
 SETTLING = 8
 # Most frames that are tried and that wait for it.

@@ -48,8 +48,6 @@ from pipelines.companions.pace import CompletePace
 from pipelines.settings import RefineSettings
 from pipelines.stopwatch import breakdown_percent
 
-__all__ = ["run_scene"]
-
 
 def run_scene(
     config: SceneConfig,

@@ -15,8 +15,6 @@ from modp_ti.inputs.protocol import Tracker
 from modp_ti.outputs.evaluation import MapVersion
 from pipelines.companions.block_files import BlockError
 
-__all__ = ["Unfinished"]
-
 
 class Unfinished:
     """Saves the map so far, and returns the exception that tells where it is and how to go on.

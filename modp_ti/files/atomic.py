@@ -14,8 +14,6 @@ from typing import IO
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["replace_file", "replace_text", "replacing", "sync_folder", "write_picture", "written_aside"]
-
 
 @contextmanager
 def replacing(path: str | os.PathLike[str], mode: str = "wb", sync: bool = True) -> Iterator[IO]:

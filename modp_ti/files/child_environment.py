@@ -5,8 +5,6 @@ from __future__ import annotations
 import os
 import sys
 
-__all__ = ["child_environment"]
-
 
 def child_environment(threads: int | None = None) -> dict[str, str]:
     """Return the environment variables for `python -c` in another process, which finds the same modules.

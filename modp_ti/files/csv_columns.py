@@ -19,8 +19,6 @@ from modp_ti.files.errors import InputError
 from modp_ti.files.limits import most_unpacked
 from modp_ti.files.reading import text_encoding
 
-__all__ = ["read_csv_blocks"]
-
 BLOCK, BLOCK_CHARACTERS = 5_000, 1 << 20  # rows and characters of a block, whichever comes first
 
 

@@ -11,8 +11,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-__all__ = ["EndingSignals", "RecordingInterrupt", "exit_code", "left_to_parent", "withheld"]
-
 ENDING = tuple(number for number in signal.Signals if number.name in ("SIGINT", "SIGTERM", "SIGHUP"))
 # Time [s] after a signal within which a SIGHUP says nothing new: shell and system both send it, systemd after SIGTERM.
 SAME_HANGUP = 2.0

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from modp_ti.files.urls import without_secrets
 
-__all__ = ["FEW", "InputError", "UnreadableImageError"]
-
 # Largest share of a recording's frames, or of a file's lines, that may be faulty. Up to it they are skipped and
 # counted; above it the whole input is rejected.
 FEW = 0.1

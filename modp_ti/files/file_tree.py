@@ -14,8 +14,6 @@ from modp_ti.files.json_text import parse_json
 from modp_ti.files.limits import BoundedZip
 from modp_ti.files.reading import is_file, open_file, read_bytes, readable, text_encoding
 
-__all__ = ["ARCHIVES", "Archive", "FileTree", "Folder", "open_tree"]
-
 ARCHIVES = (".r3d", ".zip")
 """Suffixes of recordings in one archive."""
 

@@ -10,8 +10,6 @@ from typing import Any
 from modp_ti.files.errors import InputError
 from modp_ti.files.reading import read_text, readable
 
-__all__ = ["parse_json", "read_json"]
-
 # An escaped UTF-16 surrogate. A valid character consists of a pair of them.
 HALF_CHARACTER = re.compile(r"\\u[dD][89a-fA-F]")
 # Integers with more characters than this become floats.

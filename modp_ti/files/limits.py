@@ -18,8 +18,6 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["BoundedZip", "array_of", "arrays_of", "most_unpacked"]
-
 # Data may unpack to this many bytes, plus this many times the packed ones. Text of numbers packs to a tenth, splats to
 # a quarter.
 SMALL, RATIO = 6 << 20, 25

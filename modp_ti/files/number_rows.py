@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 from modp_ti.files import LARGEST, input_lines
 from modp_ti.files.errors import InputError
 
-__all__ = ["NumberRows", "read_number_rows"]
-
 
 @dataclass(frozen=True)
 class NumberRows:

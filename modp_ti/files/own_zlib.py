@@ -14,8 +14,6 @@ import platform
 import struct
 import sys
 
-__all__ = ["keep_apart"]
-
 LIBRARY = "libz.so.1"
 # Kinds of relocations that hold the address of a symbol: R_X86_64_GLOB_DAT, _JUMP_SLOT; R_AARCH64_GLOB_DAT, _JUMP_SLOT.
 KINDS = {"x86_64": (6, 7), "aarch64": (1025, 1026)}

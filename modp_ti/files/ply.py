@@ -7,8 +7,6 @@ from pathlib import Path
 
 from modp_ti.files.errors import InputError
 
-__all__ = ["PLY_TYPES", "PlyHeader", "parse_ply_header"]
-
 # Largest header in bytes. Splats with the highest spherical harmonics degree need about 2,000.
 MAX_HEADER = 1 << 16
 MAX_DIGITS = 12

@@ -19,23 +19,6 @@ import psutil
 
 from modp_ti.files.errors import InputError
 
-__all__ = [
-    "LARGEST",
-    "MAX_LINE",
-    "available_memory",
-    "exists",
-    "input_lines",
-    "is_file",
-    "limited_lines",
-    "open_file",
-    "read_bytes",
-    "read_text",
-    "readable",
-    "reading",
-    "text_encoding",
-    "text_lines",
-]
-
 MAX_LINE = 1 << 16
 """Longest line of text in characters. No person or tracker writes longer ones."""
 

@@ -20,17 +20,6 @@ from modp_ti.files.errors import InputError
 from modp_ti.files.json_text import read_json
 from modp_ti.files.sole_use import sole_use
 
-__all__ = [
-    "PRIVATE",
-    "appearing",
-    "is_run_folder",
-    "list_files",
-    "refuse_foreign",
-    "require_usable",
-    "require_whole",
-    "run_folder",
-]
-
 PRIVATE = ".modp-ti"
 """Name of the subfolder of the list and of temporary files."""
 

@@ -13,8 +13,6 @@ from pathlib import Path
 
 from modp_ti.files.errors import InputError
 
-__all__ = ["sole_use"]
-
 # The folders that this process holds: the thread that locked each, and its device and inode.
 _held: set[tuple[int, int, int]] = set()
 

@@ -12,8 +12,6 @@ from modp_ti.files.errors import InputError
 from modp_ti.files.run_folder import PRIVATE
 from modp_ti.files.urls import actual_url
 
-__all__ = ["Storage", "StorageError"]
-
 LAST = "metrics.json"
 
 

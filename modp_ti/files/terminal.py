@@ -18,8 +18,6 @@ from rich.segment import Segment
 
 from modp_ti.files.errors import InputError
 
-__all__ = ["CleanConsole", "own_terminal", "quiet_libraries", "require_text", "shown"]
-
 _lock = Lock()
 _users = 0
 _own: int | None = None  # descriptor of Python's own standard error, if it has one

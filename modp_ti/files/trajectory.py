@@ -12,8 +12,6 @@ from fields.geometry.se3 import inverse_poses, matrices_from_unit_quaternions
 from modp_ti.files.errors import InputError
 from modp_ti.files.number_rows import NumberRows, read_number_rows
 
-__all__ = ["FARTHEST", "checked_pose", "poses_of_quaternions", "read_tum_rows", "tum_poses"]
-
 FARTHEST = 1e12
 """Largest valid coordinate [scene units]. Squared coordinates must fit the map's float32."""
 

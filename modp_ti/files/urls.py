@@ -10,8 +10,6 @@ import os
 import re
 from pathlib import Path
 
-__all__ = ["FROM_FILE", "actual_url", "shown_url", "without_secrets"]
-
 # Also with one slash, as a `Path` of a URL has.
 URL = re.compile(r"([a-z][a-z0-9+.-]+:/{1,2})(.*)", re.IGNORECASE | re.DOTALL)
 URL_IN_TEXT = re.compile(r"""(?<![\w.+-])[a-z][a-z0-9+.-]+:/{1,2}[^\s"'<>]*[^\s"'<>:;,.)]""", re.IGNORECASE)

@@ -10,8 +10,6 @@ import yaml
 
 from modp_ti.files.errors import InputError
 
-__all__ = ["parse_yaml"]
-
 # Characters, events, nesting depth, and characters of an integer.
 MAX_TEXT, MAX_EVENTS, MAX_DEPTH, MAX_DIGITS = 1 << 18, 20_000, 16, 19
 _INT = re.compile(r"[-+]?[0-9]+")

@@ -19,15 +19,6 @@ from modp_ti.files.number_rows import NumberRows
 from modp_ti.files.trajectory import poses_of_quaternions
 from modp_ti.inputs.timed_poses import require_rising
 
-__all__ = [
-    "CameraMounts",
-    "DeviceTrajectory",
-    "read_calibration",
-    "read_device_trajectory",
-    "read_observations",
-    "read_points",
-]
-
 MICROSECONDS = 1e-6
 
 

@@ -26,8 +26,6 @@ from modp_ti.inputs.sources.image_folder import IMAGE_SUFFIXES, NOT_READ, ImageF
 from modp_ti.inputs.sources.listed_images import ListedImages
 from modp_ti.inputs.sources.video_file import VIDEO_SUFFIXES, is_video
 
-__all__ = ["base_of", "is_recording", "named_scene", "recorded_scene", "streamed_scene"]
-
 OUTPUTS = Path("out")
 SCENE = "scene.yaml"
 RECORDING_SUFFIXES = (

@@ -22,22 +22,6 @@ from modp_ti.inputs.sources.distortion import NO_DISTORTION, Distortion
 from modp_ti.inputs.sources.image_header import read_image_header
 from modp_ti.inputs.sources.intrinsics import require_plausible
 
-__all__ = [
-    "OPENCV_OPENGL",
-    "Capture",
-    "CapturedFrame",
-    "DepthMap",
-    "checked_numbers",
-    "checked_time",
-    "depth_files",
-    "opencv_pose",
-    "opengl_pose",
-    "picture_size",
-    "plausible_camera",
-    "read_lines",
-    "read_numbers",
-]
-
 # From OpenGL camera axes (x right, y up, z back), which ARKit has, to OpenCV axes. The matrix is its own inverse.
 OPENCV_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 

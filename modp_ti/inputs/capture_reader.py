@@ -34,8 +34,6 @@ from modp_ti.inputs.stored_cameras import StoredView, stored_frames
 if TYPE_CHECKING:
     from modp_ti.config.settings import SceneConfig, SourceSettings
 
-__all__ = ["CaptureSettings", "DepthCaptureSettings"]
-
 
 class CaptureSettings(TrackerSettings):
     """Base class for captures, whose cameras and poses come with the images of `source.path`.

@@ -17,8 +17,6 @@ from fields.geometry.se3 import matrices_from_unit_quaternions
 from modp_ti.files import input_lines, read_bytes, readable
 from modp_ti.files.errors import InputError
 
-__all__ = ["ColmapModel", "ModelCamera", "ModelImage", "image_count", "read_colmap_model"]
-
 # Name and number of parameters of each camera model, by its number in binary files.
 CAMERA_MODELS = (
     *(("SIMPLE_PINHOLE", 3), ("PINHOLE", 4), ("SIMPLE_RADIAL", 4), ("RADIAL", 5), ("OPENCV", 8), ("OPENCV_FISHEYE", 8)),

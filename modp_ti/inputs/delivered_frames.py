@@ -17,8 +17,6 @@ from modp_ti.inputs.frame_record import FrameRecord
 from modp_ti.inputs.protocol import Tracker
 from modp_ti.inputs.tracked_points import TrackedPoints
 
-__all__ = ["DeliveredFrames", "settled"]
-
 
 @dataclass
 class DeliveredFrames:

@@ -17,8 +17,6 @@ from modp_ti.inputs.sources.image_pixels import decoded_as
 from modp_ti.inputs.sources.orientation import Turn
 from modp_ti.inputs.sources.undistortion import Undistorter
 
-__all__ = ["depth_points", "millimetre_png", "read_millimetres", "sampled_points"]
-
 # Where the depths of a pixel and its eight neighbours differ by more than this share, the pixel lies on an edge: the
 # sensor blends what is before and behind it.
 EDGE = 0.05

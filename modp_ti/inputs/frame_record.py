@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from modp_ti.inputs.sources import Picture
 
-__all__ = ["FrameRecord"]
-
 
 @dataclass(frozen=True)
 class FrameRecord:

@@ -28,22 +28,6 @@ from modp_ti.inputs.sources.protocol import require_intrinsics
 if TYPE_CHECKING:
     from modp_ti.config.settings import SourceSettings
 
-__all__ = [
-    "PANORAMAS",
-    "checked_reader",
-    "found_file",
-    "matched_entries",
-    "missing_frames_note",
-    "posed_images",
-    "read_entries",
-    "replay_poses",
-    "replay_positions",
-    "selected_frames",
-    "solving",
-    "triangulated_views",
-    "views_at",
-]
-
 T = TypeVar("T")
 
 PANORAMAS = "its images see all round: set source.panorama: {projection: equirectangular}"

@@ -18,8 +18,6 @@ from modp_ti.inputs.protocol import Before, Event, Tracker
 if TYPE_CHECKING:
     from modp_ti.inputs.sources import Picture, Undistorter
 
-__all__ = ["EarlierFrames", "JoinedTracker", "Placement", "prefix_for", "shift_after"]
-
 # Time between the last frame of the earlier map and the first new one, where the new times are not later anyway [s].
 GAP = 1.0
 

@@ -22,8 +22,6 @@ from modp_ti.inputs.sources.video_file import VIDEO_SUFFIXES, VideoFile, is_vide
 if TYPE_CHECKING:
     from modp_ti.config.settings import SceneConfig, SourceSettings
 
-__all__ = ["is_panoramic", "open_source", "open_tracker", "recognised_kind", "require_pinhole"]
-
 
 def open_source(source: SourceSettings, folder: Path | None = None) -> ImageSource:
     """Open the configured images and set their camera and scale.

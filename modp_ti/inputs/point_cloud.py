@@ -19,15 +19,6 @@ from modp_ti.files.trajectory import FARTHEST
 from modp_ti.inputs.replay import PosedImage, points_inside
 from modp_ti.inputs.sources import Undistorter
 
-__all__ = [
-    "projected_points",
-    "read_npy_points",
-    "read_ply_points",
-    "read_point_file",
-    "spread_points",
-    "visible_points",
-]
-
 # Longest header of a PCD file [bytes].
 PCD_START = 4096
 

@@ -17,8 +17,6 @@ from modp_ti.files.errors import UnreadableImageError
 if TYPE_CHECKING:
     from modp_ti.inputs.sources import Picture, Undistorter
 
-__all__ = ["Before", "Event", "LiveCounts", "Progress", "Tracker"]
-
 Event = TrackedFrame | PoseCorrection
 """What a tracker delivers: the next frame, or a correction of earlier ones."""
 

@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from modp_ti.inputs.protocol import Progress, Tracker
     from modp_ti.inputs.sources import ImageSource
 
-__all__ = ["GivenPosesSettings", "RecordedSettings", "TimedPosesSettings", "TrackerSettings", "TrajectorySettings"]
-
 
 class TrackerSettings(StrictModel):
     """Base class of readers: the `tracker` section of a scene, with what other sections depend on, and its reading.

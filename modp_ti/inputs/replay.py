@@ -20,18 +20,6 @@ from modp_ti.inputs.sources import FrameReader, ImageSource, Picture, Undistorte
 if TYPE_CHECKING:
     from modp_ti.config.settings import SourceSettings
 
-__all__ = [
-    "ALL_HELD_OUT",
-    "PosedImage",
-    "ReplayedTracker",
-    "Unreadable",
-    "is_held_out",
-    "pictures_again",
-    "points_inside",
-    "readable_sizes",
-    "tracked_frame",
-]
-
 ALL_HELD_OUT = "all frames are held out, so that nothing is mapped: select more, or set source.holdout: null"
 """Message on a recording of held-out frames alone."""
 

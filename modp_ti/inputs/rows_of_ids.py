@@ -7,8 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["RowsOfIds"]
-
 # Number of the latest ids that are kept in a dictionary, at least, and their largest share of all.
 RECENT = 4096
 SHARE = 1 / 8

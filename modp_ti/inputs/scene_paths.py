@@ -15,8 +15,6 @@ from modp_ti.files.run_folder import is_run_folder
 from modp_ti.inputs.opening import recognised_kind
 from modp_ti.inputs.readers.socket import SocketSettings
 
-__all__ = ["refuse_output_in_input"]
-
 # Folders next to the images in which trackers look for their files if `tracker.path` is empty.
 SEARCHED = ("sparse", "poses", "slam", "trajectory", "point_cloud", "orb_point_clouds")
 

@@ -19,8 +19,6 @@ from modp_ti.inputs.sources import Distortion, ImageSource, Undistorter
 from modp_ti.inputs.sources.orientation import AS_STORED, Turn
 from modp_ti.inputs.sources.undistortion import undistorter_beside
 
-__all__ = ["StoredView", "stored_frames"]
-
 
 @dataclass(frozen=True)
 class StoredView:

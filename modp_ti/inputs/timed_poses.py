@@ -23,18 +23,6 @@ from modp_ti.inputs.sources import ImageSource
 if TYPE_CHECKING:
     from modp_ti.config.settings import SourceSettings
 
-__all__ = [
-    "MAX_DIFFERENCE",
-    "TimedPoses",
-    "associate",
-    "open_ground_truth",
-    "read_trajectory_file",
-    "replay_trajectory",
-    "require_rising",
-    "rows_at_frames",
-    "true_poses",
-]
-
 # Units of times that are not seconds. Nanoseconds may have been taken for such from NANOSECONDS_FROM on.
 UNITS = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9, "microseconds since 1970": 1e3}
 

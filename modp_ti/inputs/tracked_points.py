@@ -14,8 +14,6 @@ from modp_ti.inputs.multiview.reprojection import Observations
 from modp_ti.inputs.rows_of_ids import RowsOfIds
 from pipelines.memory_budget import OBSERVATION
 
-__all__ = ["TrackedPoints"]
-
 # Colour of a point seen only by held-out frames. Held-out pixels must not leak into data that others train on.
 UNSEEN = (128, 128, 128)
 # Memory of a point [bytes].

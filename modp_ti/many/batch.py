@@ -27,8 +27,6 @@ from modp_ti.many.results import (
 from modp_ti.many.scenes import Scene, fetch_finished, finished_metrics
 from modp_ti.many.task import PATIENCE, End
 
-__all__ = ["Shares", "run_batch", "with_resources"]
-
 CSV, PARQUET, PAGE, LOGS = "batch.csv", "batch.parquet", "index.html", "logs"
 # Longest wait for an event [s]: how often the table is brought up to date at least.
 GLANCE = 0.5

@@ -22,8 +22,6 @@ from modp_ti.outputs.playback.finished_run import FinishedRun, open_run
 from pipelines.settings import RefineSettings
 from pipelines.whole.merge import MappedPart
 
-__all__ = ["MergedParts"]
-
 
 class MergedParts(EarlierMap):
     """Merges the maps of the parts of a recording, all of which must be finished.

@@ -25,8 +25,6 @@ from modp_ti.many.pool import open_pool
 from modp_ti.many.scenes import Scene, for_a_task, with_store
 from modp_ti.outputs.progress import ProgressLine
 
-__all__ = ["Part", "cut", "map_in_parts", "part_config", "parts_of", "steps_in_part"]
-
 # Least number of own frames of a part. A shorter one costs more to start than to map.
 LEAST = 8
 # How far a cut may lie from where the parts would be of equal length [shares of a part].

@@ -16,8 +16,6 @@ from modp_ti.files.errors import InputError
 from modp_ti.files.reading import available_memory
 from modp_ti.many.task import End, TaskProcess
 
-__all__ = ["Ended", "LocalPool", "Pool", "Resources", "Running", "open_pool"]
-
 # Time between two looks at the running processes [s].
 GLANCE = 0.05
 

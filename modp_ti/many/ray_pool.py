@@ -18,8 +18,6 @@ from modp_ti.files.errors import InputError
 from modp_ti.many.pool import Ended, Pool, Resources, Running
 from modp_ti.many.task import PATIENCE, End, TaskProcess, log_end
 
-__all__ = ["RayPool"]
-
 # Time between two looks at a process, and so between two reports to the machine of the command [s].
 REPORT_EVERY = 1.0
 # Longest wait for a cluster to answer [s].

@@ -21,17 +21,6 @@ from modp_ti.files.atomic import replace_text, replacing
 from modp_ti.outputs.progress import LOG_EVERY
 from modp_ti.outputs.report import facts
 
-__all__ = [
-    "ProgressTable",
-    "SceneResult",
-    "State",
-    "figures",
-    "last_stage",
-    "write_csv",
-    "write_parquet",
-    "write_summary_page",
-]
-
 
 class State(str, Enum):
     """What became of a scene."""

@@ -20,17 +20,6 @@ from modp_ti.files.urls import actual_url, shown_url
 from modp_ti.inputs.bare_recording import base_of, named_scene
 from modp_ti.inputs.scene_paths import refuse_output_in_input
 
-__all__ = [
-    "OUTPUT",
-    "SNAPSHOT_EVERY",
-    "Scene",
-    "fetch_finished",
-    "finished_metrics",
-    "for_a_task",
-    "read_scenes",
-    "with_store",
-]
-
 # Settings on which neither the map nor the other output files depend, but for the device, in the last digits.
 FREE = ("output", "device", "threads", "snapshot_every", "snapshot_store", "source.prefetch", "view")
 # Folder of the finished run's files within the scene's storage.

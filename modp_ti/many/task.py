@@ -24,8 +24,6 @@ from modp_ti.files.storage import Storage, StorageError
 from modp_ti.many.scenes import OUTPUT, finished_metrics
 from modp_ti.outputs.progress import StageProgress
 
-__all__ = ["PATIENCE", "End", "TaskProcess", "carry_out"]
-
 # Time that a task gets to save what it has when it is to end, or when the process that began it is gone [s].
 PATIENCE = 60.0
 # Time between two lines of progress in the log of a task [s].

@@ -30,21 +30,6 @@ from pipelines.pipeline import Pipeline
 from pipelines.render.renderer import RenderedView
 from pipelines.whole.shown_map import ShownMap
 
-__all__ = [
-    "FrameScore",
-    "MapVersion",
-    "StillScore",
-    "StillScorer",
-    "absolute_trajectory_error",
-    "evaluate",
-    "explained_detail",
-    "keyframe_psnr",
-    "score_frame",
-    "summary",
-    "trajectory_errors",
-    "umeyama",
-]
-
 SIGMA = 1.0  # blur that the finest band lies above [px]
 # Batch size. Each version of the map is loaded once per batch, whose frames are all held in memory.
 EVALUATED_TOGETHER = 32

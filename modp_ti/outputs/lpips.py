@@ -14,8 +14,6 @@ from torch.nn import functional
 from modp_ti.files.errors import InputError
 from pipelines.torch_checkpoint import read_checkpoint, require_entries
 
-__all__ = ["MIN_SIDE", "Lpips", "open_lpips"]
-
 # File names as used by torchvision and the `lpips` package.
 ALEXNET = "alexnet-owt-7be5be79.pth"
 LINEAR = "alex.pth"

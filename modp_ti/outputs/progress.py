@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from modp_ti.config.settings import SceneConfig
     from pipelines.pipeline import FrameReport, Pipeline
 
-__all__ = ["LiveStatus", "ProgressLine", "StageProgress", "TimeAfterMapping", "TimeLeft", "duration", "progress_ending"]
-
 # Time that a stage must have run before an estimate is made [s].
 EARLIEST = 10.0
 # Share of the elapsed time whose items set the pace. Keyframes become slower as the map grows.

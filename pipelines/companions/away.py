@@ -16,8 +16,6 @@ from fields.map.keyframe import Keyframe
 from fields.map.keyframes import KeyframeStore
 from pipelines.companions.block_files import BlockError, BlockFiles, StoredBlock, records_of, state_of
 
-__all__ = ["CHUNK", "BlockOnDisk", "BlocksOnDisk", "planes_of_views"]
-
 # Depth up to which a view counts as seeing a block [median depths of its points]. Farther things are hidden, as a rule.
 REACH = 8.0
 # Number of blocks that are looked at together, which bounds the memory that this takes.

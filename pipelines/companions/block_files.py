@@ -19,8 +19,6 @@ from numpy.typing import NDArray
 
 from fields.runtime.process import give_back_pages, has_room
 
-__all__ = ["BlockError", "BlockFiles", "StoredBlock", "records_of", "state_of"]
-
 
 class BlockError(ValueError):
     """Raised if a file of a block is missing or damaged. The message has one line."""

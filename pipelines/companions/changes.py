@@ -17,8 +17,6 @@ from pipelines.companions.paging import Paging
 from pipelines.companions.transients import EVERY, SAME_DEPTH, YOUNG, CoarseView, compared, latest, soft_mask, votes
 from pipelines.render.renderer import Renderer
 
-__all__ = ["ChangeSweep", "EarlierVisit"]
-
 
 @dataclass(frozen=True)
 class EarlierVisit:

@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from fields.frames.tracked_frame import TrackedFrame
 from fields.map.keyframe import Keyframe
 
-__all__ = ["Companion"]
-
 
 class Companion:
     """A part of the mapper that the loop calls at fixed places. All methods do nothing here.

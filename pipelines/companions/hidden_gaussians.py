@@ -13,8 +13,6 @@ from pipelines.companions.paging import Paging
 from pipelines.densify.contribution import Contribution
 from pipelines.densify.densifier import Densifier
 
-__all__ = ["HiddenGaussians"]
-
 # Number of keyframes before a sweep whose Gaussians may still grow, and are not removed.
 YOUNG = 10
 # Pyramid level of a sweep in parts, which is made while frames arrive. It takes half as long as at the full size.

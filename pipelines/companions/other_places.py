@@ -11,8 +11,6 @@ from fields.runtime.engine import ti
 from pipelines.companions.companion import Companion
 from pipelines.densify.densifier import Densifier
 
-__all__ = ["OtherPlaces"]
-
 # Largest standard deviation of a Gaussian [scene depths]: three of them reach as far as a place.
 LARGEST = FAR / 3.0
 # What a larger one becomes, as a share of it. The scene depth changes as the map grows: what was limited once would

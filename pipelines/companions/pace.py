@@ -7,8 +7,6 @@ from typing import Protocol
 
 from pipelines.settings import MappingSettings
 
-__all__ = ["FIRST_SWEEP", "CompletePace", "Pace", "Plan"]
-
 # Number of keyframes that are assumed before the first one, in the estimate of how many there will be.
 BEFORE = 4
 # Number of keyframes from which on Gaussians that hardly show are removed.

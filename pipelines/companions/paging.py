@@ -19,8 +19,6 @@ from pipelines.companions.companion import Companion
 from pipelines.memory_budget import OBSERVATION, MemoryBudget
 from pipelines.settings import MappingSettings
 
-__all__ = ["Paging", "grouped"]
-
 # Side of a block [scene depths]. An image is about one scene depth wide where most of it lies.
 SIDE = 0.125
 # Share of a limit that is used after blocks have gone to disk, so that they go rarely.

@@ -7,8 +7,6 @@ from collections.abc import Iterable
 from pipelines.companions.pace import FIRST_SWEEP, Plan
 from pipelines.settings import MappingSettings, OptimiseSettings
 
-__all__ = ["Costs", "RealtimePace", "RecordedPace", "bounded_last_views"]
-
 # Weight of a new measurement. The mean follows a growing map within some ten keyframes, and one hiccup moves it little.
 COST_WEIGHT = 0.15
 

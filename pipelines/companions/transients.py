@@ -25,24 +25,6 @@ from pipelines.companions.companion import Companion
 from pipelines.companions.paging import Paging
 from pipelines.render.renderer import RenderedView, Renderer
 
-__all__ = [
-    "EVERY",
-    "MAX_SHARE",
-    "YOUNG",
-    "Ballot",
-    "CoarseView",
-    "TransientSweep",
-    "coarse_view",
-    "compared",
-    "latest",
-    "moving",
-    "neighbours",
-    "place_of",
-    "soft_mask",
-    "votes",
-    "without",
-]
-
 # Width of the grid on which views are compared [cells].
 CELLS = 80
 # Standard deviation of the window in which differences are averaged [image widths]. Texture that is slightly out of

@@ -12,8 +12,6 @@ from fields.map.gaussians import GaussianField
 from fields.runtime.engine import ti
 from pipelines.offline_settings import OfflineSettings
 
-__all__ = ["Adaptation", "AdaptiveDensity", "GradientStatistics"]
-
 # A split divides the scales of a Gaussian by this factor.
 SPLIT_SHRINK = 1.6
 

@@ -8,8 +8,6 @@ from fields.map.keyframe import Keyframe
 from fields.runtime.engine import ti
 from pipelines.render.renderer import Renderer
 
-__all__ = ["Contribution"]
-
 
 @ti.data_oriented
 class Contribution:

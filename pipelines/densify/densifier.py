@@ -19,8 +19,6 @@ from pipelines.optimise.map_optimiser import MapOptimiser
 from pipelines.settings import MappingSettings
 from pipelines.stopwatch import Stopwatch
 
-__all__ = ["Anchor", "Densifier"]
-
 # A pixel whose rendered opacity is below this counts as a hole.
 HOLE = 0.5
 # Gaussians whose voxels are marked together, before those rest of which no Gaussian is resident.

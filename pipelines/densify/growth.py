@@ -18,8 +18,6 @@ from pipelines.memory_budget import MemoryBudget
 from pipelines.optimise.exposure import scene_colours
 from pipelines.settings import DensifySettings
 
-__all__ = ["Seeds", "dissimilarity", "error_pixels", "grow", "tracked_seeds"]
-
 # Deviation of log depth from which a depth contains no information.
 UNKNOWN = 0.5
 

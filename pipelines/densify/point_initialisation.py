@@ -13,8 +13,6 @@ from fields.map.gaussians import SH_C0, GaussianField
 from fields.map.keyframe import Keyframe
 from pipelines.optimise.exposure import scene_colours
 
-__all__ = ["PointCloud", "initialise", "spacing", "union_of_points"]
-
 NEIGHBOURS = 3
 # FLANN's identifier of a single k-d tree, whose search is exact.
 KDTREE_SINGLE = 4

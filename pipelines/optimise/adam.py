@@ -9,8 +9,6 @@ from fields.map.gaussians import GaussianField
 from fields.runtime.compiled_kernel import CompiledLoop
 from fields.runtime.engine import ti
 
-__all__ = ["Adam", "LearningRates"]
-
 # Bits of 1e18 in float32, whose square (a second moment) is still finite.
 BOUND = int(np.float32(1e18).view(np.int32))
 LARGEST_LOG = 80.0

@@ -14,17 +14,6 @@ from pipelines.render.cpu.photometric_model import IDENTITY
 from pipelines.render.renderer import Renderer
 from pipelines.settings import ExposureSettings
 
-__all__ = [
-    "COMPARED",
-    "DARK",
-    "SATURATED",
-    "ExposureRefinement",
-    "fitted_gains",
-    "light_changes",
-    "resized_vignette",
-    "scene_colours",
-]
-
 # Darker values are mostly noise, brighter ones may be saturated: neither says how bright the image is.
 DARK, SATURATED = 0.04, 0.96
 # Earlier keyframes that the latest one is compared with.

@@ -19,8 +19,6 @@ from fields.runtime.engine import ti
 from pipelines.optimise.losses import C1, C2, RADIUS, LossValues, PhotometricLoss, window_weights
 from pipelines.render.gpu.reductions import THREAD_BITS, THREADS, BlockSums, sum_over_block
 
-__all__ = ["DevicePhotometricLoss", "photometric_loss"]
-
 # Side of a tile with the border that its windows reach.
 SIDE = TILE_WIDTH + 2 * RADIUS
 HALO = SIDE * SIDE

@@ -20,8 +20,6 @@ from fields.runtime.compiled_kernel import CompiledKernel, CompiledLoop
 from fields.runtime.engine import ti
 from fields.runtime.parallel import HANDED_OUT
 
-__all__ = ["AspectPenalty", "LossValues", "PhotometricLoss", "window_weights"]
-
 RADIUS = 5
 C1 = 0.01**2
 C2 = 0.03**2

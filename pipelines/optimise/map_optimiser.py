@@ -23,8 +23,6 @@ from pipelines.optimise.safeguards import EXPLODED, Safeguards
 from pipelines.render.renderer import Renderer
 from pipelines.settings import MappingSettings
 
-__all__ = ["MapOptimiser"]
-
 
 class MapOptimiser:
     """Optimises Gaussians, and the poses and exposures of keyframes, on the images of keyframes.

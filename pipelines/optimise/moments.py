@@ -7,8 +7,6 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Moments"]
-
 
 class Moments:
     """Adam's moments by frame index.

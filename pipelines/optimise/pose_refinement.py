@@ -11,8 +11,6 @@ from fields.map.keyframe import Keyframe
 from pipelines.optimise.moments import Moments
 from pipelines.optimise.safeguards import Safeguards
 
-__all__ = ["PoseRefinement", "reprojection"]
-
 # Threshold of the Huber loss on reprojection errors [px].
 OUTLIER = 2.0
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, fields
 
-__all__ = ["EXPLODED", "Safeguards"]
-
 # Standard deviation [scene depths] beyond which a Gaussian no longer represents any part of the scene.
 EXPLODED = 100.0
 

@@ -14,8 +14,6 @@ from pipelines.optimise.gpu_losses import photometric_loss
 from pipelines.optimise.pose_refinement import PoseRefinement
 from pipelines.render.renderer import Renderer
 
-__all__ = ["ViewAlignment"]
-
 STEPS = 40
 # Step lengths of the first and the last step [px]; they decay geometrically.
 FIRST, LAST = 0.3, 0.02

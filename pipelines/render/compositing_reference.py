@@ -11,8 +11,6 @@ from fields.runtime.engine import ti
 from pipelines.render.cpu.compositing import ALPHA_MAX, OPAQUE, Compositing
 from pipelines.render.cpu.projection import ALPHA_MIN
 
-__all__ = ["ReferenceCompositing"]
-
 
 @ti.data_oriented
 class ReferenceCompositing(Compositing):

@@ -19,8 +19,6 @@ from fields.runtime.engine import engine, lock, ti
 from fields.runtime.tenancy import empty, settled
 from pipelines.render.renderer import Renderer
 
-__all__ = ["RasterizedView", "rasterize"]
-
 REAL = {torch.float32: ti.f32, torch.float64: ti.f64}
 # Size of the pool on a GPU, where it is allocated at once. On the CPU, memory follows the Gaussians in use.
 GPU_POOL = 1_500_000

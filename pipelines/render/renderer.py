@@ -26,8 +26,6 @@ from pipelines.render.gpu.compositing import DeviceCompositing
 from pipelines.render.gpu.photometric_model import DevicePhotometricModel
 from pipelines.render.gpu.projection import DeviceProjection
 
-__all__ = ["RenderedView", "Renderer"]
-
 
 class CompositingStage(Protocol):
     """Protocol of compositing on the CPU and on a GPU."""

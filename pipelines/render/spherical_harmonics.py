@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from fields.map.gaussians import SH_C0
 from fields.runtime.engine import ti
 
-__all__ = ["add_sh_gradient", "evaluate_sh", "sh_basis", "sh_rotation"]
-
 # Number of directions in the fit of a rotation matrix, more than the 16 harmonics.
 DIRECTIONS = 64
 

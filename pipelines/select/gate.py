@@ -21,8 +21,6 @@ from pipelines.settings import GateSettings
 if TYPE_CHECKING:  # `modp-ti check` measures sharpness without loading PyTorch
     from pipelines.render.renderer import Renderer
 
-__all__ = ["FrameGate", "sharpness"]
-
 
 def sharpness(rgb: NDArray[np.uint8]) -> float:
     """Ratio of the detail of an image to the detail of its half-size version.

@@ -14,8 +14,6 @@ from fields.map.trajectory import Trajectory
 from pipelines.select.gate import sharpness
 from pipelines.settings import KeyframeSettings
 
-__all__ = ["KeyframeSelector"]
-
 
 class KeyframeSelector:
     """Decides for each frame whether it becomes a keyframe.

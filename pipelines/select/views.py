@@ -11,8 +11,6 @@ from fields.map.covisibility import SeenPoints, covisibility
 from fields.map.keyframes import KeyframeStore
 from pipelines.settings import ViewSettings
 
-__all__ = ["LocalGlobalViews", "ViewSelection", "global_probabilities"]
-
 
 class ViewSelection(Protocol):
     """Protocol of a policy that selects the views of an optimisation step."""

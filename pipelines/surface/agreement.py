@@ -11,8 +11,6 @@ from fields.runtime.engine import ti
 from pipelines.densify.depth.epipolar import plane_warp
 from pipelines.surface.plane_sweep import LANES
 
-__all__ = ["agreeing_views"]
-
 IMAGE = ti.types.ndarray(dtype=ti.f32, ndim=2)
 Placed = tuple[PinholeCamera, NDArray[np.float64], NDArray[np.float32]]
 

@@ -3,8 +3,6 @@
 
 from fields.runtime.engine import ti
 
-__all__ = ["integrate"]
-
 IMAGE = ti.types.ndarray(dtype=ti.f32, ndim=2)
 COLOURS = ti.types.ndarray(dtype=ti.f32, ndim=3)
 VALUES = ti.types.ndarray(dtype=ti.f32, ndim=1)

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from pipelines.surface.agreement import agreeing_views
 from pipelines.surface.matched_depth import DepthView
 
-__all__ = ["fitted_plane", "joined_depth", "planes_of_plain_regions"]
-
 # A pixel is plain if the grey values of its 3x3 neighbourhood differ by less than PLAIN. Regions with a smaller share
 # of the view than LEAST_REGION are left alone.
 PLAIN = 0.03

@@ -20,8 +20,6 @@ from fields.geometry.se3 import inverse_se3
 from pipelines.densify.depth.epipolar import plane_warp
 from pipelines.surface.plane_sweep import PlaneSweep
 
-__all__ = ["DepthMatcher", "DepthView", "choose_neighbours"]
-
 # Number of neighbours of a view, and the preferred parallaxes (baseline over median depth). Each parallax gets a third
 # of the neighbours, if possible as many before the view as after it.
 PARALLAXES = (0.25, 0.12, 0.06)

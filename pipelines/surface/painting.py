@@ -7,8 +7,6 @@ from numpy.typing import NDArray
 from fields.geometry.camera import PinholeCamera
 from fields.runtime.engine import ti
 
-__all__ = ["Paint"]
-
 # A picture sees a point if its depth there differs by at most this fraction.
 VISIBLE = 0.02
 # Weights of pictures are (cosine of the slant / depth) to this power. High powers prefer the sharpest picture.

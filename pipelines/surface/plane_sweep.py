@@ -11,8 +11,6 @@ from fields.runtime.backend import on_gpu
 from fields.runtime.engine import ti
 from fields.runtime.parallel import HANDED_OUT
 
-__all__ = ["LANES", "MAX_STEPS", "PlaneSweep"]
-
 # Most sweep steps, both directions and the middle one.
 MAX_STEPS = 33
 # A constant added to the variance of matching windows, which suppresses weaker contrast.

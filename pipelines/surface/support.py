@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 from fields.geometry.camera import PinholeCamera
 from fields.runtime.engine import ti
 
-__all__ = ["supporting_views"]
-
 MATRIX = ti.types.ndarray(dtype=ti.f32, ndim=2)
 COUNTS = ti.types.ndarray(dtype=ti.i32, ndim=1)
 Placed = tuple[PinholeCamera, NDArray[np.float64], NDArray[np.float32]]

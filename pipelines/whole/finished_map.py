@@ -16,8 +16,6 @@ from pipelines.densify.densifier import Anchor
 from pipelines.online import OnlineMapper
 from pipelines.render.cpu.photometric_model import IDENTITY
 
-__all__ = ["FinishedMap", "go_on", "placed_by", "take_in_frames", "take_in_gaussians"]
-
 
 @dataclass(frozen=True)
 class FinishedMap:

@@ -15,8 +15,6 @@ from fields.geometry.camera import PinholeCamera
 from fields.runtime.engine import ti
 from pipelines.render.renderer import Renderer
 
-__all__ = ["FreeSpace", "ShownSurface"]
-
 # A Gaussian is before a surface if its depth is less than this share of the surface's.
 BEFORE = 0.85
 # Least opacity of a pixel with a surface.

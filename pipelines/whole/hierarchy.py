@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from fields.geometry.se3 import matrices_from_unit_quaternions, quaternions_from_matrices
 from fields.map.blocks import divide, extent_of
 
-__all__ = ["LEVELS", "Hierarchy", "Level", "merged", "side_of"]
-
 # Number of levels below the map itself. Each has cells of twice the side of the one above.
 LEVELS = 4
 # Number of Gaussians of a surface in a cell of the first level, about. A block is as large as a cell of the last one.

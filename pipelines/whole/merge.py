@@ -16,8 +16,6 @@ from pipelines.render.cpu.photometric_model import IDENTITY
 from pipelines.whole.finished_map import FinishedMap, take_in_frames, take_in_gaussians
 from pipelines.whole.free_space import FreeSpace, ShownSurface
 
-__all__ = ["MappedPart", "Shown", "colour_changes", "exposed_in", "merge", "owned", "recoloured"]
-
 Exposures = Mapping[int, NDArray[np.float64]]
 
 

@@ -14,8 +14,6 @@ from fields.map.gaussians import GaussianField
 from fields.runtime.process import give_back_heap, give_back_pages
 from pipelines.whole.hierarchy import Hierarchy, side_of
 
-__all__ = ["ShownMap"]
-
 # Number of Gaussians of a block, about.
 GAUSSIANS_EACH = 50
 

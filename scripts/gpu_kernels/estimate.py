@@ -19,11 +19,6 @@ from pipelines.render.cpu.binning import Binning
 from pipelines.render.gpu.compositing_gradient import STEP
 from pipelines.render.renderer import Renderer
 
-__all__ = [
-    "BATCHES", "CARDS", "Card", "Work", "backward_counts", "count_work", "forward_counts", "measure_work",
-    "memory_milliseconds", "milliseconds",
-]  # fmt: skip
-
 # Gaussians of a batch in shared memory.
 BATCHES = {"forward": TILE_PIXELS, "backward": STEP}
 WARPS = TILE_PIXELS // WARP  # of a tile

@@ -8,8 +8,6 @@ from dataclasses import dataclass
 
 from modp_ti.files.errors import InputError
 
-__all__ = ["Counts", "LoopCounts", "instructions_of", "loop_counts"]
-
 LABEL = re.compile(r"^\s*(\.L_\w+):")
 INSTRUCTION = re.compile(r"^\s*/\*[0-9a-f]{4,}\*/\s+(@!?U?P\d\s+)?([A-Z0-9_.]+)(.*?);?\s*$")
 TARGET = re.compile(r"`\((\.L_\w+)\)")

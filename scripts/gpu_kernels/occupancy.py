@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-__all__ = ["ARCHITECTURES", "Architecture", "blocks_per_multiprocessor", "limit", "occupancy"]
-
 WARP = 32
 REGISTERS = 65_536  # of a multiprocessor
 SCHEDULERS = 4  # parts of a multiprocessor, each with a quarter of the registers

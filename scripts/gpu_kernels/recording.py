@@ -14,8 +14,6 @@ from pathlib import Path
 
 from modp_ti.files.errors import InputError
 
-__all__ = ["Launch", "Recording", "record", "recorded"]
-
 SOURCE = Path(__file__).with_name("stand_in_driver.c")
 PROJECT = Path(__file__).resolve().parents[2]
 # Where the driver writes, and the compute capability of the device that it presents.

@@ -13,8 +13,6 @@ from gpu_kernels.recording import record
 from gpu_kernels.toolkit import Assembled, assemble, disassemble
 from modp_ti.files.errors import InputError
 
-__all__ = ["COMPOSITING", "Kernel", "Survey", "survey"]
-
 # The compositing kernels: those that must not spill, and of which the first two are in every step.
 COMPOSITING = {
     "DeviceCompositing._forward": "forward",

@@ -7,8 +7,6 @@ from collections.abc import Sequence
 from gpu_kernels.estimate import CARDS, Work, backward_counts, forward_counts, memory_milliseconds, milliseconds
 from gpu_kernels.survey import COMPOSITING, Kernel, Survey
 
-__all__ = ["report"]
-
 ESTIMATE = """\
 Estimated time of a step on one view, on cards that nobody has measured. Compositing: the instructions that all warps
 issue, counted from the machine code and from the lists that the CPU bins in tiles of 16x16 pixels, divided by

@@ -12,8 +12,6 @@ from pathlib import Path
 
 from modp_ti.files.errors import InputError
 
-__all__ = ["Assembled", "assemble", "disassemble", "parse_ptxas", "tool", "version"]
-
 # Wheels with the tools. PTX for sm_120 needs CUDA 12.8 or newer, and CUDA 13 still has sm_75.
 WHEELS = {"ptxas": "nvidia-cuda-nvcc==13.0.88", "nvdisasm": "nvidia-cuda-nvdisasm==13.5.37"}
 ENTRY = re.compile(r"Compiling entry function '(\S+)' for '(\S+)'")

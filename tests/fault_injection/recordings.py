@@ -10,8 +10,6 @@ import numpy as np
 from modp_ti.outputs.formats.trajectory import write_trajectory
 from tests.room import Room, RoomRecording, pinhole, walk
 
-__all__ = ["FPS", "HOLDOUT", "write_recording"]
-
 HOLDOUT = 8
 FPS = 10.0
 WALK = 2.4  # length of the camera's path [m]

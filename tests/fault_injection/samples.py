@@ -54,8 +54,6 @@ from tests.fault_injection.tracker_samples import (
     write_tum_rgbd,
 )
 
-__all__ = ["CAPTURES", "SAMPLES", "Sample", "write_sample"]
-
 
 @dataclass(frozen=True)
 class Sample:

@@ -12,8 +12,6 @@ import numpy as np
 from tests.bags import OPTICAL, Messages, write_bag
 from tests.fault_injection.small_recording import FOCAL, FRAMES, HEIGHT, WIDTH, picture, position, wall
 
-__all__ = ["BAGS", "write_small_bag"]
-
 BAGS = {"ros1": "room.bag", "sqlite3": "room.db3", "mcap": "room.mcap"}
 """Name of the bag's file, by its form."""
 

@@ -9,27 +9,6 @@ import cv2
 import numpy as np
 from PIL import Image
 
-__all__ = [
-    "FOCAL",
-    "FRAMES",
-    "HEIGHT",
-    "INTRINSICS",
-    "NAMES",
-    "WIDTH",
-    "picture",
-    "pixels_on",
-    "points_file",
-    "points_ply",
-    "position",
-    "scene_file",
-    "seen_on",
-    "tum_line",
-    "wall",
-    "write_bytes",
-    "write_images",
-    "write_text",
-]
-
 WIDTH, HEIGHT, FOCAL, FRAMES = 48, 36, 40.0, 3
 INTRINSICS = f"intrinsics: {{fx: {FOCAL}, cx: {WIDTH / 2}, cy: {HEIGHT / 2}}}"
 NAMES = [f"frame-{i:06d}.color.png" for i in range(FRAMES)]

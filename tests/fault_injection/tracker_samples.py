@@ -30,26 +30,6 @@ from tests.fault_injection.small_recording import (
     write_text,
 )
 
-__all__ = [
-    "colmap_binary",
-    "colmap_text",
-    "write_aria",
-    "write_colmap_binary",
-    "write_colmap_text",
-    "write_log",
-    "write_matrices",
-    "write_modp",
-    "write_orbslam3",
-    "write_points_ply",
-    "write_replica",
-    "write_scene",
-    "write_sevenscenes",
-    "write_stella",
-    "write_transforms",
-    "write_tum",
-    "write_tum_rgbd",
-]
-
 
 def colmap_text(folder: Path, names: list[str] = NAMES) -> None:
     write_text(folder, "sparse/0/cameras.txt", [f"1 PINHOLE {WIDTH} {HEIGHT} {FOCAL} {FOCAL} {WIDTH / 2} {HEIGHT / 2}"])

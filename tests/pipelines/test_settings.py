@@ -8,7 +8,9 @@ from pipelines import settings
 from pipelines.offline_settings import OfflineSettings
 from pipelines.settings import DensifySettings, MappingSettings, RefineSettings, StrictModel
 
-SECTIONS = [getattr(settings, name) for name in settings.__all__ if name != "StrictModel"]
+SECTIONS = [
+    model for model in vars(settings).values() if isinstance(model, type) and issubclass(model, settings.StrictModel)
+]
 
 
 @pytest.mark.parametrize("section", SECTIONS, ids=lambda section: section.__name__)

@@ -23,8 +23,6 @@ from modp_ti.files.storage import Storage, StorageError
 from modp_ti.outputs.evaluation import MapVersion
 from modp_ti.outputs.report.record import RunRecord
 
-__all__ = ["Checkpointer", "SnapshotStore"]
-
 # Failures in a row after which nothing more is copied, since each may take minutes.
 TOO_MANY = 2
 

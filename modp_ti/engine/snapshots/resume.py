@@ -20,8 +20,6 @@ from modp_ti.inputs.protocol import Event, Tracker
 from modp_ti.inputs.readers.socket import SocketSettings
 from modp_ti.inputs.sources.frame_store import list_frames
 
-__all__ = ["RECORDING", "Recovery", "continued", "discard", "fetch_snapshot", "load_resumed", "replay"]
-
 # Scene file in the output folder, which is there only while a live run goes on, or if it was killed.
 RECORDING = "recording.yaml"
 # Beginning of the names of the temporary folders in which live trackers keep what they receive.

@@ -29,17 +29,6 @@ from modp_ti.outputs.report.record import FrameNote, RunRecord, StepNote
 from modp_ti.version import __version__
 from pipelines.state import MapState
 
-__all__ = [
-    "FILE",
-    "Position",
-    "Snapshot",
-    "StreamDigest",
-    "frames_state",
-    "of_another_program",
-    "record_state",
-    "version_state",
-]
-
 FILE = "snapshot.npz"
 # Version of the arrays and the JSON. Others are refused, as they hold the state of different code.
 VERSION = 6

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from rosbags.rosbag1 import Reader as Reader1
     from rosbags.rosbag2 import Reader as Reader2
 
-__all__ = ["CLOUD", "IMAGES", "INFO", "POSES", "SUFFIXES", "TREES", "VIDEO", "Bag", "Place", "has_poses", "is_bag"]
-
 SUFFIXES = (".bag", ".db3", ".mcap")
 """Suffixes of bags: ROS 1, and ROS 2 by sqlite3 and MCAP."""
 

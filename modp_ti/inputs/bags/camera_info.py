@@ -8,8 +8,6 @@ from modp_ti.inputs.capture import checked_numbers, plausible_camera
 from modp_ti.inputs.sources.distortion import NO_DISTORTION, lens_of_model
 from modp_ti.inputs.sources.intrinsics import Intrinsics
 
-__all__ = ["camera_of_info", "info_beside", "is_rectified"]
-
 
 def camera_of_info(message: Any, rectified: bool, where: str) -> Intrinsics | None:
     """Return the camera of a CameraInfo message; None if it says that it is not calibrated.

@@ -12,8 +12,6 @@ from modp_ti.files.trajectory import FARTHEST
 from modp_ti.inputs.bags.bag import Bag
 from modp_ti.inputs.bags.frame_tree import FrameTree, clean, seconds
 
-__all__ = ["cloud_points", "world_points"]
-
 # Types of the coordinates by PointField's `datatype`.
 FLOATS = {7: "f4", 8: "f8"}
 MOST_POINTS = 500_000

@@ -27,8 +27,6 @@ from modp_ti.inputs.sources.intrinsics import Intrinsics
 if TYPE_CHECKING:
     from modp_ti.inputs.readers.bag import BagSettings
 
-__all__ = ["DepthTopic", "depth_metres", "depth_topics", "read_depth_topic", "with_depth_points"]
-
 # A depth image belongs to an image that was taken at most so long before or after it [s].
 LARGEST_DELAY = 0.05
 # Largest number of points of a frame. No two frames have one in common, so that more say little of the others.

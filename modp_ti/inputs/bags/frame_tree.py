@@ -14,8 +14,6 @@ from modp_ti.files.errors import InputError
 from modp_ti.inputs.bags.bag import STATIC, TREES, Bag
 from modp_ti.inputs.bags.motion import Motion
 
-__all__ = ["FrameTree", "clean", "pose_row", "read_frame_tree", "seconds"]
-
 
 def clean(frame: str) -> str:
     """Return the name of a frame without the slash that ROS 1 may begin it with."""

@@ -31,8 +31,6 @@ from modp_ti.inputs.sources.intrinsics import Intrinsics
 from modp_ti.inputs.sources.protocol import ImageSource
 from modp_ti.inputs.sources.video_file import VideoFile
 
-__all__ = ["BagImages"]
-
 SAMPLED = 16  # images of 16 bits per channel by which their depth is found
 
 

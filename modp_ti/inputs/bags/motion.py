@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from modp_ti.files.errors import InputError
 from modp_ti.files.trajectory import poses_of_quaternions
 
-__all__ = ["Motion"]
-
 # Between quaternions whose cosine is larger, rotations are interpolated linearly: the sine of the angle is too small.
 ALMOST_EQUAL = 1.0 - 1e-9
 

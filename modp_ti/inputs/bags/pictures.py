@@ -13,19 +13,6 @@ from modp_ti.inputs.bags.bag import VIDEO
 from modp_ti.inputs.sources.image_header import read_image_header, why_undecodable
 from modp_ti.inputs.sources.image_pixels import DEPTHS, decoded, reduced
 
-__all__ = [
-    "DEPTH_ENCODINGS",
-    "begins_video",
-    "is_compressed",
-    "is_deep",
-    "is_depth",
-    "is_grey",
-    "picture",
-    "picture_size",
-    "stored_values",
-    "video_codec",
-]
-
 DEPTH_ENCODINGS = ("16UC1", "32FC1")
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
 # By what the messages of a video may state.

@@ -11,8 +11,6 @@ from modp_ti.inputs.bags.bag import Bag
 from modp_ti.inputs.bags.frame_tree import clean, pose_row, seconds
 from modp_ti.inputs.bags.motion import Motion
 
-__all__ = ["PoseTopic", "read_pose_topic"]
-
 
 @dataclass(frozen=True)
 class PoseTopic:

@@ -8,8 +8,6 @@ from typing import Any
 
 from modp_ti.files.limits import most_unpacked
 
-__all__ = ["is_packed", "limit_unpacking", "unpacked"]
-
 MAX_RATIO = 100  # of a chunk, which may hold dark images
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 

@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import inverse_se3, matrix_from_quaternion, quaternion_from_matrix
 
-__all__ = ["CONVENTIONS", "STATED", "Convention"]
-
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 # From the axes of a body in ROS (x forward, y left, z up) to those of its camera.
 BODY = np.array([[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])

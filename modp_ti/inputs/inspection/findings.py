@@ -15,21 +15,6 @@ from fields.geometry.se3 import camera_centres
 from modp_ti.inputs.inspection.survey import FrameRecord
 from modp_ti.inputs.replay import ALL_HELD_OUT
 
-__all__ = [
-    "Finding",
-    "Scale",
-    "Severity",
-    "blurred",
-    "duplicates",
-    "judge_scale",
-    "judge_sequence",
-    "measure_scale",
-    "note",
-    "time_gaps",
-    "unusable",
-    "verdict",
-    "warning",
-]
 # A frame is blurred if its sharpness is below this factor of the median of the AROUND frames on each side. The factor
 # is the default of keyframe selection.
 BLURRED = 0.75

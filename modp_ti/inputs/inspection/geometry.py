@@ -19,19 +19,6 @@ from modp_ti.inputs.inspection.survey import GAPS, MatchedPair, Survey, survey
 from modp_ti.inputs.multiview.features import essential_matrix
 from modp_ti.inputs.replay import ReplayedTracker
 
-__all__ = [
-    "LEAST_MATCHES",
-    "EpipolarScore",
-    "Geometry",
-    "best_convention",
-    "epipolar_score",
-    "first_look",
-    "judge_geometry",
-    "measure_geometry",
-    "nonsense",
-    "require_fitting",
-]
-
 FITTING = 2.5  # px of the image used for detection, threshold of a fitting match
 # Smallest angle [degrees] between the rays of a match at which the sign of its depth is reliable.
 LEAST_ANGLE = 0.5

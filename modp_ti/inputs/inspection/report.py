@@ -15,8 +15,6 @@ from modp_ti.inputs.inspection.findings import Finding, Scale, blurred, duplicat
 from modp_ti.inputs.inspection.geometry import Geometry
 from modp_ti.inputs.inspection.survey import FrameRecord
 
-__all__ = ["judged", "measured", "print_report"]
-
 SIGNS = {"note": "note", "warning": "[yellow]warning[/]", "unusable": "[red]unusable[/]"}
 
 

@@ -16,8 +16,6 @@ from modp_ti.inputs.multiview.features import Features, detect_features, match_a
 from modp_ti.inputs.multiview.reprojection import estimated
 from pipelines.select.gate import sharpness
 
-__all__ = ["FrameRecord", "MatchedPair", "Survey", "matched_pair", "survey"]
-
 # At PLACES frames of the sequence, features are matched with the frames of the same view GAPS times further on.
 GAPS = (1, 2, 4)
 PLACES = 8

@@ -14,19 +14,6 @@ from modp_ti.inputs.sources import NO_DISTORTION, Distortion, Intrinsics
 if TYPE_CHECKING:
     from modp_ti.files.quiet_pycolmap import pycolmap
 
-__all__ = [
-    "ADVICE",
-    "BEFORE_TRACKING",
-    "FOCAL_FROM",
-    "TYPICAL_FOCAL",
-    "WHILE_TRACKING",
-    "CameraRefinement",
-    "Lens",
-    "estimation_note",
-    "intrinsics_of",
-    "is_plausible",
-]
-
 
 class Lens:
     """A camera with one of COLMAP's models.

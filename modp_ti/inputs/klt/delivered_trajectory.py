@@ -17,8 +17,6 @@ from modp_ti.inputs.multiview.reprojection import ray_errors
 from modp_ti.inputs.replay import points_inside
 from modp_ti.inputs.sources import Undistorter
 
-__all__ = ["DeliveredFrame", "DeliveredTrajectory"]
-
 MAX_ERROR = 2.5  # points with a larger reprojection error [px of the tracked image] are not delivered
 # Send a correction once a keyframe has moved by `NOTABLE` px of the tracked image; include every keyframe that has
 # moved by `MOVED` px.

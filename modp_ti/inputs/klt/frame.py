@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from modp_ti.inputs.multiview.features import Features, detect_features
 
-__all__ = ["WANTED", "Frame", "LocalisedFrame", "corners", "describe", "flow"]
-
 WANTED = 450  # features that are tracked
 DESCRIBED_SIDE = 400  # longer side at which SIFT features are detected: 60 % of the time that 640 px take
 WINDOW = (21, 21)

@@ -14,8 +14,6 @@ from modp_ti.inputs.klt.landmark_map import Keyframe, LandmarkMap, triangulated
 from modp_ti.inputs.multiview.features import match_anywhere
 from modp_ti.inputs.multiview.reprojection import estimated, pose_from_points, ray_errors
 
-__all__ = ["Initialisation", "TwoViews", "two_views"]
-
 FEWEST_SHARED = 60  # features that two views must share
 # Least motion of the pair, as a share of the image's longer side, and least parallax in degrees. After PATIENCE frames
 # half the parallax is enough.

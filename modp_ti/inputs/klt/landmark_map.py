@@ -15,8 +15,6 @@ from modp_ti.inputs.multiview.bundle_adjustment import Refinable, adjusted_apart
 from modp_ti.inputs.multiview.features import Features
 from modp_ti.inputs.multiview.reprojection import ray_errors
 
-__all__ = ["LANDMARKS", "Keyframe", "LandmarkMap"]
-
 # Observations with a larger reprojection error [px] are outliers.
 MAX_ERROR = 2.5
 # Smallest angle [degrees] between the rays of a new landmark. With less parallax its depth is unreliable.

@@ -15,18 +15,6 @@ from modp_ti.inputs.klt.frame import BORDER, Frame, LocalisedFrame
 from modp_ti.inputs.klt.landmark_map import LandmarkMap
 from modp_ti.inputs.multiview.reprojection import pose_from_points, ray_errors, refine_pose
 
-__all__ = [
-    "FEWEST",
-    "MAX_ERROR",
-    "SIGMA",
-    "align_landmarks",
-    "localised",
-    "predicted_pixels",
-    "realigned",
-    "reference_views",
-    "searched",
-]
-
 MAX_ERROR = 3.0  # landmarks with a larger reprojection error [px] are no longer tracked
 SIGMA = 1.0  # px, scale of the robust loss
 FEWEST = 20  # fewest landmarks for a pose

@@ -16,17 +16,6 @@ from modp_ti.inputs.klt.map_connection import connected
 from modp_ti.inputs.klt.recognition import PlaceIndex, Recognition, agreeing, recognised
 from modp_ti.inputs.klt.tracking import Tracking
 
-__all__ = [
-    "YOUNGEST",
-    "Link",
-    "LoopClosing",
-    "LoopDetection",
-    "carry_over",
-    "closed_loop",
-    "closed_map",
-    "solver_is_there",
-]
-
 EVERY = 5  # new keyframes that are compared together, at least
 # A search is given EVERY keyframes of time, and one for each GROWTH keyframes of the map, whose adjustment takes longer
 # the larger the map is.

@@ -22,8 +22,6 @@ from modp_ti.inputs.klt.recognition import (
 from modp_ti.inputs.klt.tracking import Tracking
 from modp_ti.inputs.multiview.reprojection import estimated, ray_errors
 
-__all__ = ["MapJoining", "connected", "joint_similarity"]
-
 ROUNDS = 2  # bundle adjustments, each without the outliers of the one before
 # The map contradicts a connection if the residuals of more of the connecting observations, or of the others, are those
 # of outliers after the adjustment.

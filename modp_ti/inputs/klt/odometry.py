@@ -17,8 +17,6 @@ from modp_ti.inputs.klt.loop_closing import LoopClosing
 from modp_ti.inputs.klt.map_connection import MapJoining, connected, joint_similarity
 from modp_ti.inputs.klt.tracking import Tracking, View
 
-__all__ = ["Odometry"]
-
 # Keyframes or frames from which the frames of the first map are delivered. A map that is lost before is that of a bad
 # start.
 ESTABLISHED = 8

@@ -34,8 +34,6 @@ from modp_ti.inputs.sources.image_header import focal_length_35mm
 if TYPE_CHECKING:
     from modp_ti.config.settings import SourceSettings
 
-__all__ = ["estimated_intrinsics", "open_klt"]
-
 CALIBRATION_FRAMES = 300
 CALIBRATION_STRIDE = 3
 DIAGONAL_35MM = 43.27  # mm

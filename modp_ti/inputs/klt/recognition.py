@@ -17,19 +17,6 @@ from modp_ti.inputs.multiview.appearance import nearest_words, vlad
 from modp_ti.inputs.multiview.features import Features, essential_matrix, match_anywhere
 from modp_ti.inputs.multiview.reprojection import pose_from_points, ray_errors
 
-__all__ = [
-    "PlaceIndex",
-    "Recognition",
-    "agreeing",
-    "alike_keyframes",
-    "described_keyframe",
-    "inherited",
-    "place_by_features",
-    "recognised",
-    "thumbnail",
-    "world_points",
-]
-
 # Thresholds in px of the tracked image. MAX_ERROR is RANSAC's, and is wide because many depths are those of neighbours.
 # A SIFT feature nearer than SAME_PLACE to a landmark takes its depth.
 MAX_ERROR = 5.0

@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.sources import FrameReader, ImageSource
 
-__all__ = ["arriving", "available", "followed_scale", "read_image", "require_size"]
-
 FOLLOWED_SIDE = 640  # longer side [px] of the images in which features are tracked, at most
 
 

@@ -20,8 +20,6 @@ from modp_ti.inputs.protocol import Event, LiveCounts, Progress, Tracker
 from modp_ti.inputs.replay import PosedImage, Unreadable, pictures_again, tracked_frame
 from modp_ti.inputs.sources import FrameReader, Intrinsics, Picture, Undistorter
 
-__all__ = ["KltTracker"]
-
 BEGINS_ANEW_AFTER = 10  # frames without a pose after which another map may begin
 
 

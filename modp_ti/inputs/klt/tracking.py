@@ -19,8 +19,6 @@ from modp_ti.inputs.klt.recognition import alike_keyframes, inherited, place_by_
 from modp_ti.inputs.multiview.bundle_adjustment import Refinable
 from modp_ti.inputs.multiview.reprojection import refine_pose
 
-__all__ = ["Tracking", "View"]
-
 # A frame becomes a keyframe if the features have moved by KEYFRAME_SHIFT of the image's longer side since the last
 # keyframe, or if less than KEYFRAME_SHARE of its landmarks are still seen.
 KEYFRAME_SHIFT = 0.05

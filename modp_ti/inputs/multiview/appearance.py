@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 
 from modp_ti.inputs.multiview.features import Features
 
-__all__ = ["Appearance", "image_pairs", "nearest_words", "vlad"]
-
 # Words of the vocabulary, and the most descriptors that it is trained with. On redkitchen, 16, 32 and 64 words find the
 # same views.
 WORDS = 32

@@ -17,8 +17,6 @@ from modp_ti.files.child_environment import child_environment
 if TYPE_CHECKING:
     from modp_ti.files.quiet_pycolmap import pycolmap
 
-__all__ = ["Bundle", "Refinable", "adjusted_apart", "adjusted_bundle", "main"]
-
 TOLERANCE = 1e-5  # relative change of the cost below which the optimisation stops
 
 Refinable = Literal["focal", "distortion"]

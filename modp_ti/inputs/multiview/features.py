@@ -8,18 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "MAX_FEATURES",
-    "Features",
-    "Matches",
-    "detect_features",
-    "essential_matrix",
-    "feature_tracks",
-    "match_anywhere",
-    "match_features",
-    "shrunk_grey",
-]
-
 MAX_SIDE = 1000
 MAX_FEATURES = 2000
 RATIO = 0.8

@@ -13,8 +13,6 @@ from modp_ti.inputs.protocol import Progress
 from modp_ti.inputs.replay import PosedImage
 from modp_ti.inputs.sources import ImageSource
 
-__all__ = ["EPIPOLAR_BAND", "FollowedFeatures", "follow_features", "looks_like_video"]
-
 MAX_SIDE = 640  # longer side [px] of the images in which corners are tracked, at most
 CORNERS = 800  # corners tracked at a time
 REFILL_BELOW = 0.8  # share of CORNERS below which new ones are detected

@@ -19,8 +19,6 @@ from modp_ti.inputs.multiview.reprojection import (
     sum_by_point,
 )
 
-__all__ = ["MAX_ERROR", "adjusted_poses", "placed_anew", "solve_points", "surest_points"]
-
 MAX_ERROR = 2.0  # largest reprojection error [px of the image used for detection]
 
 # For tracked corners: points with less parallax [degrees] are used only where a frame would otherwise have fewer than

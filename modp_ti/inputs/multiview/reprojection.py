@@ -11,18 +11,6 @@ from numpy.typing import NDArray
 
 from fields.geometry.se3 import exp_se3, orthonormalised
 
-__all__ = [
-    "Observations",
-    "estimated",
-    "point_errors",
-    "pose_from_points",
-    "ray_errors",
-    "refine_points",
-    "refine_pose",
-    "solve_damped",
-    "sum_by_point",
-]
-
 POSE_STEPS = 10
 POINT_STEPS = 6
 

@@ -20,8 +20,6 @@ from modp_ti.inputs.sources.intrinsics import Intrinsics
 if TYPE_CHECKING:
     from modp_ti.files.quiet_pycolmap import pycolmap
 
-__all__ = ["MatchedImage", "reconstructed"]
-
 # Pairs that are matched between two reports of the progress.
 BATCH = 100
 # A model of fewer images is none.

@@ -24,8 +24,6 @@ from modp_ti.inputs.protocol import Progress
 from modp_ti.inputs.replay import PosedImage, points_inside
 from modp_ti.inputs.sources import ImageSource
 
-__all__ = ["adjusted_frames", "neighbouring_views", "triangulated_frames"]
-
 # Views are matched with those GAPS frames apart, and with the NEIGHBOURS nearest others by pose. The growing gaps give
 # parallax in videos.
 GAPS = (1, 2, 3, 5)

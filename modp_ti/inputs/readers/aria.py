@@ -36,8 +36,6 @@ from modp_ti.inputs.timed_poses import rows_at_frames
 if TYPE_CHECKING:
     from modp_ti.config.settings import SceneConfig, SourceSettings
 
-__all__ = ["AriaSettings"]
-
 CLOSED_LOOP, OPEN_LOOP = "closed_loop_trajectory.csv", "open_loop_trajectory.csv"
 CALIBRATION = "online_calibration.jsonl"
 POINTS = ("semidense_points.csv.gz", "semidense_points.csv", "global_points.csv.gz", "global_points.csv")

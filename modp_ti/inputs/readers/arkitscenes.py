@@ -16,8 +16,6 @@ from modp_ti.inputs.capture_reader import DepthCaptureSettings
 from modp_ti.inputs.depth_maps import millimetre_png
 from modp_ti.inputs.timed_poses import associate
 
-__all__ = ["ArkitScenesSettings"]
-
 TRAJECTORY, IMAGES, INTRINSICS = "lowres_wide.traj", "lowres_wide", "lowres_wide_intrinsics"
 NAME = re.compile(r"([0-9]{1,12})_([0-9]{1,9}\.[0-9]{1,9})")
 CONFIDENT = 2  # of 0, 1 and 2

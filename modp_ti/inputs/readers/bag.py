@@ -31,8 +31,6 @@ if TYPE_CHECKING:
     from modp_ti.config.settings import SceneConfig, SourceSettings
     from modp_ti.inputs.bags.images import BagImages
 
-__all__ = ["BagSettings"]
-
 
 class BagSettings(TrackerSettings):
     """Poses and points of a ROS bag."""

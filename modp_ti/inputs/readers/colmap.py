@@ -37,8 +37,6 @@ from modp_ti.inputs.stored_cameras import StoredView, stored_frames
 if TYPE_CHECKING:
     from modp_ti.config.settings import SceneConfig, SourceSettings
 
-__all__ = ["ColmapSettings", "open_model"]
-
 TOPS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
 
 # Most points that a frame gets of a model whose images observe none.

@@ -26,8 +26,6 @@ from modp_ti.inputs.capture_reader import CaptureSettings
 from modp_ti.inputs.sources.distortion import EQUIDISTANT, PLUMB_BOB, Distortion, lens_of_model
 from modp_ti.inputs.timed_poses import associate
 
-__all__ = ["EurocSettings"]
-
 LISTING, SENSOR = "cam0/data.csv", "cam0/sensor.yaml"
 # The true poses of the body, or those of markers on it: EuRoC's, TUM-VI's and EuRoC's raw ones.
 TRUTHS = "state_groundtruth_estimate0", "mocap0", "vicon0"

@@ -21,8 +21,6 @@ from modp_ti.inputs.capture import (
 )
 from modp_ti.inputs.capture_reader import CaptureSettings
 
-__all__ = ["KittiSettings"]
-
 CALIBRATION, TIMES = "calib.txt", "times.txt"
 CAMERAS = (2, 0, 3, 1)  # colour before grey, left before right
 

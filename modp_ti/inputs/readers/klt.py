@@ -12,8 +12,6 @@ from modp_ti.inputs.reader import TrackerSettings
 if TYPE_CHECKING:
     from modp_ti.config.settings import SceneConfig
 
-__all__ = ["KltSettings"]
-
 
 class KltSettings(TrackerSettings):
     """The built-in tracker, which needs only the images."""

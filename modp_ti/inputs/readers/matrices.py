@@ -20,8 +20,6 @@ from modp_ti.inputs.replay import ReplayedTracker
 if TYPE_CHECKING:
     from modp_ti.config.settings import SceneConfig
 
-__all__ = ["MatricesSettings"]
-
 NAMES = ("poses.txt", "traj.txt")
 
 

@@ -30,8 +30,6 @@ from modp_ti.inputs.sources.masks import read_vignette
 if TYPE_CHECKING:
     from modp_ti.config.settings import SceneConfig, SourceSettings
 
-__all__ = ["ModpSettings"]
-
 POSES = "trajectory.json"
 # File names that the release uses with ORB-SLAM3 as its tracker.
 POSES_ORB = "trajectory_orb.json"

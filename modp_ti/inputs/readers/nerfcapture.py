@@ -18,8 +18,6 @@ from modp_ti.inputs.capture import (
 )
 from modp_ti.inputs.capture_reader import CaptureSettings
 
-__all__ = ["NerfCaptureSettings"]
-
 FILE = "transforms.json"
 KEYS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
 

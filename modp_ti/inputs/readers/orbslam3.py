@@ -17,8 +17,6 @@ from modp_ti.inputs.timed_poses import replay_trajectory
 if TYPE_CHECKING:
     from modp_ti.config.settings import SceneConfig
 
-__all__ = ["OrbSlam3Settings"]
-
 # The trajectories of all frames and of the keyframes. A run with a name writes f_NAME.txt and kf_NAME.txt.
 FRAMES, KEYFRAMES = "CameraTrajectory.txt", "KeyFrameTrajectory.txt"
 

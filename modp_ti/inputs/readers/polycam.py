@@ -12,8 +12,6 @@ from modp_ti.inputs.capture import Capture, CapturedFrame, checked_numbers, dept
 from modp_ti.inputs.capture_reader import DepthCaptureSettings
 from modp_ti.inputs.depth_maps import millimetre_png
 
-__all__ = ["PolycamSettings"]
-
 CAMERAS, IMAGES = "keyframes/cameras", "keyframes/images"
 CORRECTED_CAMERAS, CORRECTED_IMAGES = "keyframes/corrected_cameras", "keyframes/corrected_images"
 SUFFIXES = (".jpg", ".jpeg", ".png")

@@ -25,8 +25,6 @@ from modp_ti.inputs.capture import (
 )
 from modp_ti.inputs.capture_reader import DepthCaptureSettings
 
-__all__ = ["Record3dSettings"]
-
 METADATA = ("metadata", "metadata.json")
 FOLDERS = ("rgbd", "rgb")
 SUFFIXES = (".jpg", ".jpeg", ".png")

@@ -28,8 +28,6 @@ from modp_ti.inputs.sources.listed_images import ListedImages
 if TYPE_CHECKING:
     from modp_ti.config.settings import SceneConfig, SourceSettings
 
-__all__ = ["ReplicaSettings"]
-
 IMAGES = "results"
 IMAGE = re.compile(r"results/(frame[0-9].*\.jpg)")
 # The data set states cx 599.5 and cy 339.5 with pixel centres at whole numbers, which is the middle of the image.

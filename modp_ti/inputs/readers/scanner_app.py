@@ -22,8 +22,6 @@ from modp_ti.inputs.capture import (
 from modp_ti.inputs.capture_reader import DepthCaptureSettings
 from modp_ti.inputs.depth_maps import millimetre_png
 
-__all__ = ["ScannerAppSettings"]
-
 FRAME, PICTURE = re.compile(r"frame_([0-9]{5})\.json"), re.compile(r"frame_[0-9]+\.jpg")
 SIZE = (1920, 1440)  # of the images that the intrinsics belong to
 CONFIDENT = 2  # of 0, 1 and 2

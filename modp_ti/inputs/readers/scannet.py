@@ -23,8 +23,6 @@ from modp_ti.inputs.capture import (
 from modp_ti.inputs.capture_reader import DepthCaptureSettings
 from modp_ti.inputs.depth_maps import read_millimetres
 
-__all__ = ["ScanNetSettings"]
-
 COLOUR, DEPTH = "intrinsic/intrinsic_color.txt", "intrinsic/intrinsic_depth.txt"
 RATE = 30.0  # images per second
 

@@ -28,8 +28,6 @@ from modp_ti.inputs.sources.protocol import ImageSource
 if TYPE_CHECKING:
     from modp_ti.config.settings import SceneConfig, SourceSettings
 
-__all__ = ["SevenScenesSettings"]
-
 POSE_SUFFIX = ".pose.txt"
 # The data set calibrates only its depth camera (f = 585). These are approximate values for the sensor's colour camera.
 CAMERA = PinholeCamera(525.0, 525.0, 320.0, 240.0, 640, 480)

@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from modp_ti.config.settings import SceneConfig, SourceSettings
     from modp_ti.inputs.multiview.structure import MatchedImage
 
-__all__ = ["SfmSettings"]
-
 # The fingerprint of what a kept model was made of. A change of the method must change METHOD.
 MADE_OF = "made_of.txt"
 METHOD = "2"

@@ -13,8 +13,6 @@ from modp_ti.inputs.reader import TrackerSettings
 if TYPE_CHECKING:
     from modp_ti.config.settings import SceneConfig
 
-__all__ = ["SocketSettings"]
-
 
 class SocketSettings(TrackerSettings):
     """Another program that sends frames and poses through a socket."""

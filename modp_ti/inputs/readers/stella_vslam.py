@@ -32,8 +32,6 @@ from modp_ti.inputs.timed_poses import TimedPoses, read_trajectory_file, rows_at
 if TYPE_CHECKING:
     from modp_ti.config.settings import SceneConfig, SourceSettings
 
-__all__ = ["StellaVslamSettings", "read_stella_map"]
-
 TRAJECTORY = "frame_trajectory.txt"
 # Bounds on lengths stated in the file. The reader allocates an array, including nested ones, when it reads the length,
 # before it has seen the content.

@@ -23,8 +23,6 @@ from modp_ti.inputs.capture import (
 from modp_ti.inputs.capture_reader import DepthCaptureSettings
 from modp_ti.inputs.depth_maps import millimetre_png
 
-__all__ = ["StrayScannerSettings"]
-
 VIDEO, TABLE, MATRIX = "rgb.mp4", "odometry.csv", "camera_matrix.csv"
 SIZE = (1920, 1440)  # of the images that the intrinsics belong to
 POSE = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")

@@ -21,8 +21,6 @@ from modp_ti.inputs.replay import ReplayedTracker
 if TYPE_CHECKING:
     from modp_ti.config.settings import SceneConfig
 
-__all__ = ["TanksAndTemplesSettings"]
-
 MOST_IMAGES = 1e9
 BLOCK = 5  # lines of an image: three integers, and four rows of a matrix, camera to world
 

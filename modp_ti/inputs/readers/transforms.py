@@ -44,8 +44,6 @@ from modp_ti.inputs.stored_cameras import StoredView, stored_frames
 if TYPE_CHECKING:
     from modp_ti.config.settings import SceneConfig, SourceSettings
 
-__all__ = ["TransformsSettings", "masks_of_transforms"]
-
 NAME = "transforms.json"
 
 PERSPECTIVE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")

@@ -26,8 +26,6 @@ from modp_ti.inputs.timed_poses import replay_trajectory
 if TYPE_CHECKING:
     from modp_ti.config.settings import SceneConfig, SourceSettings
 
-__all__ = ["TumSettings"]
-
 NAMES = ("groundtruth.txt", "trajectory.txt", "CameraTrajectory.txt", "KeyFrameTrajectory.txt")
 
 LISTING = "rgb.txt"

@@ -21,8 +21,6 @@ from modp_ti.inputs.sources.protocol import ImageSource
 if TYPE_CHECKING:
     from modp_ti.config.settings import VrsSettings
 
-__all__ = ["AriaRecording"]
-
 RGB = "camera-rgb"
 
 

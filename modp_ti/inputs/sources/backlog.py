@@ -10,8 +10,6 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-__all__ = ["LIMIT", "Arrivals", "Backlog", "Thinning"]
-
 Item = TypeVar("Item")
 
 # Frames that may wait: 20 s at 30 frames a second.

@@ -8,8 +8,6 @@ from pathlib import Path
 from modp_ti.files import read_text
 from modp_ti.inputs.sources.image_pixels import quiet_opencv
 
-__all__ = ["Camera", "find_cameras"]
-
 LINUX_DEVICES = Path("/sys/class/video4linux")
 # Numbers that are tried where the system lists no devices.
 TRIED = 10

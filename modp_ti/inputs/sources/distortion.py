@@ -11,17 +11,6 @@ from numpy.typing import NDArray
 
 from modp_ti.files.errors import InputError
 
-__all__ = [
-    "COEFFICIENTS",
-    "EQUIDISTANT",
-    "NO_DISTORTION",
-    "PLUMB_BOB",
-    "Distortion",
-    "colmap_intrinsics",
-    "colmap_lens",
-    "lens_of_model",
-]
-
 Points = NDArray[np.float64]
 
 TABLE_SIZE = 4096

@@ -15,8 +15,6 @@ from modp_ti.inputs.sources.intrinsics import Intrinsics
 from modp_ti.inputs.sources.panorama import Face, faces_of, projection_of
 from modp_ti.inputs.sources.protocol import ImageSource
 
-__all__ = ["PanoramaFaces"]
-
 # Pixels that the panorama is continued by beyond its edges, for the cubic filter.
 MARGIN = 4
 

@@ -18,8 +18,6 @@ from modp_ti.inputs.sources.undistortion import Undistorter, both_valid
 if TYPE_CHECKING:
     from modp_ti.config.settings import SourceSettings
 
-__all__ = ["FrameReader", "Picture"]
-
 # Largest relative difference of the aspect ratios of vignette and image, which allows for rounding after resizing.
 ASPECT_TOLERANCE = 0.01
 

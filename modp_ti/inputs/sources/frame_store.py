@@ -16,8 +16,6 @@ from modp_ti.inputs.sources.image_header import read_image_header
 from modp_ti.inputs.sources.image_pixels import decoded
 from modp_ti.inputs.sources.protocol import ImageSource
 
-__all__ = ["FrameStore", "StoredFrames", "kept_frames", "list_frames"]
-
 
 def kept_frames(folder: Path) -> dict[str, dict[str, str | None]]:
     """Return the settings that read the delivered frames again, see `Tracker.kept`."""

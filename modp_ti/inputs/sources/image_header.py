@@ -22,17 +22,6 @@ from modp_ti.files import open_file
 from modp_ti.files.errors import InputError
 from modp_ti.files.reading import available_memory
 
-__all__ = [
-    "HEADER_ERRORS",
-    "MAX_IMAGE_PIXELS",
-    "ImageHeader",
-    "focal_length_35mm",
-    "heif_kind",
-    "open_heif",
-    "read_image_header",
-    "why_undecodable",
-]
-
 MAX_IMAGE_PIXELS = 1 << 27
 """Largest number of pixels of an image. The largest cameras have about 150 million; the map works on far fewer."""
 

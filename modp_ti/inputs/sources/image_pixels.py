@@ -17,19 +17,6 @@ from modp_ti.inputs.sources.image_header import HEADER_ERRORS, ImageHeader, heif
 from modp_ti.inputs.sources.orientation import turn_of_exif
 from modp_ti.inputs.sources.tone_mapping import ToneMapping, Transfer
 
-__all__ = [
-    "DEPTHS",
-    "alpha_of",
-    "decoded",
-    "decoded_as",
-    "decoded_deep",
-    "in_srgb",
-    "quiet_opencv",
-    "reduced",
-    "used_bits",
-    "way_to_srgb",
-]
-
 DEPTHS = (8, 10, 12, 14, 16)
 """Depths of cameras [bits] whose values are stored in 16 bits."""
 

@@ -15,8 +15,6 @@ from modp_ti.inputs.sources.undistortion import Undistorter
 if TYPE_CHECKING:
     from modp_ti.config.settings import IntrinsicsSettings
 
-__all__ = ["MAX_SIDE", "Intrinsics", "given_intrinsics", "require_plausible"]
-
 MAX_SIDE = 1 << 16
 """Largest side of an image [px]. No camera has more."""
 # Larger values come from damaged files: focal lengths and principal points [px], and lens coefficients.

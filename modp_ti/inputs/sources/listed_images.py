@@ -29,8 +29,6 @@ from modp_ti.inputs.sources.intrinsics import Intrinsics
 from modp_ti.inputs.sources.orientation import AS_STORED, Turn, turns_of
 from modp_ti.inputs.sources.protocol import IMAGE_SUFFIXES, ImageSource
 
-__all__ = ["ListedImages"]
-
 SAMPLED = 16  # images of 16 bits per channel by which their depth is found
 
 

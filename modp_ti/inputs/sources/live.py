@@ -25,8 +25,6 @@ from modp_ti.inputs.sources.frame_store import FrameStore, kept_frames
 from modp_ti.inputs.sources.image_pixels import quiet_opencv
 from modp_ti.inputs.sources.protocol import ImageSource
 
-__all__ = ["LiveSource"]
-
 # Memory [bytes] of decoded frames that wait for the tracker. Further ones wait on disk.
 MEMORY = 64 << 20
 # Timeout of a network stream [s], for opening it and for each frame.

@@ -17,8 +17,6 @@ from modp_ti.inputs.sources.image_header import why_undecodable
 from modp_ti.inputs.sources.listed_images import ListedImages, decoded_as
 from modp_ti.inputs.sources.undistortion import both_valid
 
-__all__ = ["LEAST_LIGHT", "MaskFolder", "differs_from_colour", "read_vignette"]
-
 VALID_FROM = 128  # grey value
 # Pixels that get a smaller share of the light than this are mostly noise and are masked.
 LEAST_LIGHT = 0.05

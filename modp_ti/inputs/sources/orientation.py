@@ -13,8 +13,6 @@ from fields.geometry.camera import PinholeCamera
 from modp_ti.inputs.sources.distortion import Distortion
 from modp_ti.inputs.sources.image_header import ImageHeader
 
-__all__ = ["AS_STORED", "Turn", "turn_of_exif", "turns_of"]
-
 
 @dataclass(frozen=True)
 class Turn:

@@ -13,8 +13,6 @@ from modp_ti.inputs.sources.backlog import Arrivals, Backlog
 from modp_ti.inputs.sources.orientation import Turn
 from modp_ti.inputs.sources.protocol import ImageSource
 
-__all__ = ["PacedSource"]
-
 
 class PacedSource(ImageSource):
     """A recorded source whose images arrive at the times of their time stamps, the first one at once.

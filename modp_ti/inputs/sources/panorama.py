@@ -11,8 +11,6 @@ from fields.geometry.camera import PinholeCamera
 from modp_ti.config.camera_settings import PanoramaSettings
 from modp_ti.files.errors import InputError
 
-__all__ = ["Face", "Projection", "faces_of", "looks_panoramic", "projection_of"]
-
 # Largest relative difference of an image's width from twice its height.
 SHAPE_TOLERANCE = 0.01
 # How far an equirectangular image's left edge may be from its right one beyond two pixels' steps, and the largest

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from modp_ti.inputs.capture import Capture
     from modp_ti.inputs.sources.backlog import Arrivals
 
-__all__ = ["IMAGE_SUFFIXES", "ImageSource", "require_intrinsics"]
-
 IMAGE_SUFFIXES = (
     *(".jpg", ".jpeg", ".jfif", ".jpe", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm", ".jp2"),
     *(".heic", ".heif", ".hif", ".avif"),

@@ -16,8 +16,6 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["PEAK", "WHITE", "ToneMapping", "Transfer"]
-
 PEAK, WHITE = 1000.0, 203.0
 """Brightest light that is kept apart from others, and what it is mapped to [cd/m²]."""
 

@@ -11,8 +11,6 @@ from fields.frames.camera_revision import CameraRevision
 from fields.geometry.camera import PinholeCamera
 from modp_ti.inputs.sources.distortion import NO_DISTORTION, Distortion
 
-__all__ = ["Undistorter", "both_valid", "undistorter_beside"]
-
 # The inverse of the lens model is searched up to this multiple of the image corner's radius.
 SEARCH_MARGIN = 1.5
 

@@ -23,8 +23,6 @@ from modp_ti.inputs.sources.tone_mapping import PEAK, WHITE, ToneMapping, Transf
 if TYPE_CHECKING:
     import av
 
-__all__ = ["VIDEO_SUFFIXES", "VideoFile", "is_video"]
-
 VIDEO_SUFFIXES = (
     *(".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".ts", ".mts", ".m2ts"),
     *(".wmv", ".flv", ".3gp", ".ogv", ".h264", ".h265", ".hevc", ".mjpg", ".mjpeg"),

@@ -9,8 +9,6 @@ from threading import Event
 
 from modp_ti.inputs.tracker_server.messages import HEADER, Hello, Kind, ProtocolError, encoded, parse_header
 
-__all__ = ["GLANCE", "Connection", "OthersSpeakError", "SenderGoneError"]
-
 # Timeout [s] for the first message after its first byte, so that a stalled client does not block a tracker.
 FIRST_PATIENCE = 5.0
 # Time [s] for which input is still read and discarded after an error. Closing a socket with unread input resets the

@@ -12,8 +12,6 @@ from pathlib import Path
 
 from modp_ti.files.errors import InputError
 
-__all__ = ["DEFAULT_ADDRESS", "HELLO_PATIENCE", "Lobby", "listen", "open_to_others"]
-
 DEFAULT_ADDRESS = "127.0.0.1:7007"
 # Largest size of a Unix socket's path in bytes.
 MAX_SOCKET_PATH = 107

@@ -18,25 +18,6 @@ from modp_ti.files.trajectory import FARTHEST, checked_pose
 from modp_ti.inputs.sources import NO_DISTORTION, Distortion, Intrinsics
 from modp_ti.inputs.sources.intrinsics import require_plausible
 
-__all__ = [
-    "HEADER",
-    "POINT",
-    "Correction",
-    "Encoding",
-    "Frame",
-    "Hello",
-    "Kind",
-    "ProtocolError",
-    "State",
-    "UnfitError",
-    "encoded",
-    "parse_correction",
-    "parse_frame",
-    "parse_header",
-    "parse_hello",
-    "parse_points",
-]
-
 MAGIC = b"MODP"
 VERSION = 1
 

@@ -11,8 +11,6 @@ import numpy as np
 from fields.frames.tracked_frame import SparsePoints
 from modp_ti.inputs.tracker_server.messages import Correction, Frame, ProtocolError, State, UnfitError
 
-__all__ = ["Ordering"]
-
 # Limits of what may wait behind a frame without a pose. Images wait on disk.
 MAX_WAITING = 2_000  # frames and corrections
 MAX_WAITING_BYTES = 256 << 20  # bytes of points and poses

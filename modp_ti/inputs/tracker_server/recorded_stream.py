@@ -20,8 +20,6 @@ from modp_ti.inputs.tracker_server.messages import (
     parse_hello,
 )
 
-__all__ = ["FRAMES", "STREAM", "is_stream", "send_again"]
-
 # Names in a spool's folder: the file of the messages, and the folder of the images, which FRAMEs have left out.
 STREAM, FRAMES = "stream.modp", "frames"
 

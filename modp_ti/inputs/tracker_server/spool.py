@@ -36,8 +36,6 @@ from modp_ti.inputs.tracker_server.recorded_stream import FRAMES, STREAM
 if TYPE_CHECKING:
     from modp_ti.config.settings import SourceSettings
 
-__all__ = ["Spool", "SpoolFullError"]
-
 
 class SpoolFullError(Exception):
     """The disk has no space for another frame. The text is one line."""

@@ -39,8 +39,6 @@ if TYPE_CHECKING:
     from modp_ti.config.settings import SourceSettings
     from modp_ti.inputs.readers.socket import SocketSettings
 
-__all__ = ["TrackerServer", "open_tracker_server"]
-
 # What the server has received, in order; the images and points of frames are in the spool.
 _Waiting = PosedImage | PoseCorrection | InputError | None
 

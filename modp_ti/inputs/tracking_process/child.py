@@ -35,8 +35,6 @@ from modp_ti.inputs.tracking_process.exchange import (
     SlotLayout,
 )
 
-__all__ = ["Outbox", "main"]
-
 # Interval [s] at which the counts are published and the wish to finish is noticed.
 GLANCE = 0.05
 # Events that may wait for the mapper. A frame without its image takes some 15 KB.

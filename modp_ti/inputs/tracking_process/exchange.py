@@ -21,20 +21,6 @@ from modp_ti.inputs.frame_record import FrameRecord
 from modp_ti.inputs.protocol import LiveCounts
 from modp_ti.inputs.sources import Intrinsics, Picture
 
-__all__ = [
-    "CameraRevised",
-    "CountsBoard",
-    "Delivered",
-    "Ended",
-    "FrameRing",
-    "Job",
-    "Opened",
-    "Preparing",
-    "RingMade",
-    "SlotLayout",
-    "anonymous_memory",
-]
-
 # Numbers of a `CountsBoard`: the counts, the number of frames, the wish to finish, and whether the stream goes on.
 NUMBERS = 8
 

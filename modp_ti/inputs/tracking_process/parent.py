@@ -39,8 +39,6 @@ from modp_ti.inputs.tracking_process.exchange import (
     anonymous_memory,
 )
 
-__all__ = ["TrackingProcess"]
-
 # Time [s] that the process gets to end by itself.
 PATIENCE = 2.0
 

@@ -23,8 +23,6 @@ from modp_ti.files.atomic import replace_file
 from modp_ti.outputs.formats.splat_packing import morton_order, opacities, packed, smallest_three, unit_quaternions
 from modp_ti.outputs.formats.splats_ply import COMMENT
 
-__all__ = ["write_compressed_ply"]
-
 CHUNK = 256
 RANGES = [
     f"{bound}_{name}"

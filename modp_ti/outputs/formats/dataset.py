@@ -19,8 +19,6 @@ from modp_ti.files.errors import InputError
 from modp_ti.inputs.sources import Picture
 from modp_ti.inputs.tracked_points import TrackedPoints
 
-__all__ = ["image_names", "new_folder", "rename_images", "write_colmap", "write_image", "write_transforms"]
-
 # Converts OpenCV camera axes to OpenGL camera axes.
 OPENGL_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 

@@ -35,8 +35,6 @@ from fields.map.gaussians import SH_C0
 from modp_ti.files.atomic import replace_file
 from modp_ti.outputs.formats.splat_packing import HALF_TURN, TURNED, opacities, to_bits, unit_quaternions
 
-__all__ = ["write_mesh_glb", "write_splat_glb"]
-
 POINTS, TRIANGLES, VERTICES, INDICES = 0, 4, 34962, 34963
 # componentType and whether integers stand for [0, 1], by the type of an array's numbers.
 COMPONENTS = {"uint8": (5121, True), "uint16": (5123, True), "uint32": (5125, False), "float32": (5126, False)}

@@ -27,19 +27,6 @@ if TYPE_CHECKING:
     from open3d.pybind.geometry import TriangleMesh
     from open3d.pybind.t.geometry import VoxelBlockGrid
 
-__all__ = [
-    "LEAST_OPACITY",
-    "MESH_SUFFIXES",
-    "TRUNCATION",
-    "SurfaceView",
-    "extracted",
-    "fused",
-    "read_mesh",
-    "supported",
-    "without_edges",
-    "write_mesh",
-]
-
 MESH_SUFFIXES = (".ply", ".glb", ".obj")
 # Truncation distance in voxels before and behind the surface. Larger values round off corners and merge the two sides
 # of thin objects: on the demo, 85.6 percent of the vertices were correct with 2.5, 84.2 with 3, and 81.3 with 4.

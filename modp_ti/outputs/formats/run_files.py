@@ -35,20 +35,6 @@ from modp_ti.outputs.formats.splats_ply import write_splats
 from modp_ti.outputs.formats.trajectory import write_trajectory
 from pipelines.render.cpu.photometric_model import IDENTITY
 
-__all__ = [
-    "NOT_ALWAYS",
-    "FramesRecord",
-    "read_exposures",
-    "read_frames",
-    "read_masks",
-    "read_scores",
-    "write_exposures",
-    "write_frames",
-    "write_map",
-    "write_masks",
-    "write_scores",
-]
-
 NOT_ALWAYS = ("colmap", "exposure.json", "masks")
 """What `write_map` writes that another map may lack, or have other files in."""
 

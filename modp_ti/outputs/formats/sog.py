@@ -40,8 +40,6 @@ from modp_ti.files.atomic import replace_file
 from modp_ti.outputs.formats.splat_packing import morton_order, opacities, smallest_three, to_bits, unit_quaternions
 from pipelines.whole.hierarchy import LEVELS, Hierarchy, Level
 
-__all__ = ["sog_bytes", "write_sog", "write_sog_lod"]
-
 CODES = 256
 # Rounds of Lloyd's algorithm for a codebook and for the palette.
 CODE_ROUNDS, PALETTE_ROUNDS = 20, 3

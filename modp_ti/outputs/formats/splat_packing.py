@@ -7,17 +7,6 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "HALF_TURN",
-    "TURNED",
-    "morton_order",
-    "opacities",
-    "packed",
-    "smallest_three",
-    "to_bits",
-    "unit_quaternions",
-]
-
 # A rotation by 180 degrees around x, to axes with y up: of positions, and of the harmonics of degree 1, 2 and 3, of
 # which those that are odd in (y, z) change their sign.
 HALF_TURN = np.array([1.0, -1.0, -1.0])

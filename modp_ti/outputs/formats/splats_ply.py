@@ -17,8 +17,6 @@ from modp_ti.files.errors import InputError
 from modp_ti.files.ply import parse_ply_header
 from modp_ti.files.reading import open_file
 
-__all__ = ["check_splats", "read_splats", "write_splats"]
-
 # The filter that the map was optimised with: 0.3 px^2 of blur and the opacity compensation of mip-splatting. Other
 # renderers must use the same to reproduce the images. Brush and splat-transform read this comment and do so by
 # themselves.

@@ -40,8 +40,6 @@ from modp_ti.outputs.formats.splat_packing import (
     unit_quaternions,
 )
 
-__all__ = ["DEFAULT_VERSION", "write_spz"]
-
 # The version that most viewers read.
 DEFAULT_VERSION = 3
 MAGIC, ANTIALIASED = 0x5053474E, 1

@@ -18,8 +18,6 @@ from pipelines.surface.painting import Paint
 if TYPE_CHECKING:
     from open3d.pybind.geometry import TriangleMesh
 
-__all__ = ["TexturedMesh", "painted", "require_atlas", "unwrapped"]
-
 # Most triangles of a textured mesh. The texture shows the detail, and the atlas of more takes minutes.
 TRIANGLES = 60_000
 # Approximate side of the texture, and distance between its charts [px].

@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from modp_ti.files.atomic import replace_text
 from modp_ti.files.trajectory import read_tum_rows, tum_poses
 
-__all__ = ["read_trajectory", "tum_line", "write_trajectory"]
-
 
 def write_trajectory(
     path: str | os.PathLike[str], timestamps: Iterable[float], poses: Iterable[NDArray[np.float64]]

@@ -19,8 +19,6 @@ from fields.map.gaussians import SH_C0
 from modp_ti.files.atomic import replace_file
 from modp_ti.outputs.formats.splat_packing import opacities, to_bits, unit_quaternions
 
-__all__ = ["write_web_splat"]
-
 RECORD = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)])
 
 

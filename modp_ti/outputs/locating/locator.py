@@ -26,8 +26,6 @@ from modp_ti.outputs.playback.finished_run import FinishedRun, open_run
 from modp_ti.outputs.playback.map_renderer import MapRenderer, start_device
 from modp_ti.outputs.progress import ProgressLine
 
-__all__ = ["Location", "Locator", "PictureCamera", "camera_of", "given_camera", "read_picture"]
-
 # Largest relative difference of the aspect ratios of pictures from one camera, which allows for rounding.
 SAME_ASPECT = 0.005
 # Most keyframes that the map is rendered from, evenly spaced.

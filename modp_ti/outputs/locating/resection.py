@@ -11,8 +11,6 @@ from fields.geometry.camera import PinholeCamera
 from fields.geometry.pixel_metric import pixel_jacobian
 from modp_ti.inputs.multiview.reprojection import estimated
 
-__all__ = ["Resection", "pose_covariance", "reprojection_errors", "resect"]
-
 CONFIDENCE = 0.9999
 MOST_TRIALS = 5000
 LEAST_SHARE = 0.03  # of inliers, for the number of trials

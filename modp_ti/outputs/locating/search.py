@@ -19,8 +19,6 @@ from modp_ti.outputs.playback.map_renderer import MapRenderer, eight_bits
 from pipelines.optimise.view_alignment import ViewAlignment
 from pipelines.render.renderer import RenderedView
 
-__all__ = ["Found", "MapViews", "PlacedFeatures", "Search", "likeness", "map_depth", "matched", "rendered_features"]
-
 # Standard deviations [px] of the blurs between which structures count: coarser than the detail that a map lacks, finer
 # than light and shade.
 FINE, COARSE = 1.5, 8.0

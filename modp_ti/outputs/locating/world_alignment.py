@@ -13,8 +13,6 @@ from fields.geometry.pixel_metric import pixel_metric
 from fields.geometry.se3 import exp_se3, inverse_se3, log_se3
 from fields.geometry.similarity import motion_around, moved_pose, scale_of
 
-__all__ = ["AGREEING", "LEAST_POINTS", "PlacedFrame", "WorldAlignment", "image_motion", "world_alignment"]
-
 # Fewest tracked points with a depth in the map that give a frame its scale.
 LEAST_POINTS = 10
 # Fewest frames that must agree on the similarity.

@@ -7,8 +7,6 @@ from numpy.typing import NDArray
 
 from fields.geometry.se3 import camera_centres, inverse_poses
 
-__all__ = ["looking_at", "orbit", "smoothed"]
-
 # Weight that pulls the focus to the points at the scene's depth on the optical axes. It determines the focus if the
 # axes are parallel.
 HELD = 0.1

@@ -45,8 +45,6 @@ from pipelines.surface.joined_depth import joined_depth
 from pipelines.surface.matched_depth import DepthMatcher, DepthView
 from pipelines.whole.hierarchy import Hierarchy
 
-__all__ = ["ExportOptions", "export_map"]
-
 TEXTURED_NAME, PAGE = "mesh.glb", "map.html"
 # Edge of the mesh's voxels, and largest depth that is fused, both relative to the scene's depth.
 VOXEL, FARTHEST = 1 / 160, 4.0

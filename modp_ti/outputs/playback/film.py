@@ -24,19 +24,6 @@ from modp_ti.outputs.playback.map_renderer import MapRenderer, eight_bits, start
 from modp_ti.outputs.progress import ProgressLine
 from pipelines.render.renderer import RenderedView
 
-__all__ = [
-    "PATHS",
-    "VIDEO_SUFFIXES",
-    "Flight",
-    "depth_colours",
-    "film",
-    "is_video",
-    "plan_flight",
-    "require_writable",
-    "write_pictures",
-    "write_video",
-]
-
 # Codec by suffix, its options, and those of the file, whose index stands in front so that a browser plays while it
 # loads. Every browser plays both; H.264 is much faster to write.
 VIDEO_SUFFIXES = {

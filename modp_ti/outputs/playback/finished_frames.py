@@ -14,8 +14,6 @@ from modp_ti.inputs.sources import Picture
 from modp_ti.outputs.playback.finished_run import FinishedRun
 from modp_ti.outputs.playback.run_pictures import Preparing, pictures
 
-__all__ = ["FinishedFrames", "frames_of"]
-
 
 class FinishedFrames:
     """The frames of a finished run in its world. Images are read one by one.

@@ -21,8 +21,6 @@ from modp_ti.outputs.formats.run_files import FramesRecord, read_frames
 from modp_ti.outputs.formats.splats_ply import read_splats
 from modp_ti.outputs.formats.trajectory import read_trajectory
 
-__all__ = ["FinishedRun", "open_run"]
-
 NEEDED = ("config.yaml", "splats.ply", "trajectory.txt", "colmap", "frames.json")
 
 

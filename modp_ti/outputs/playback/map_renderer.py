@@ -16,8 +16,6 @@ from modp_ti.files.errors import InputError
 from pipelines.render.renderer import RenderedView, Renderer
 from pipelines.whole.shown_map import ShownMap
 
-__all__ = ["MAX_SIDE", "MapRenderer", "start_device"]
-
 # Largest side of a picture [px]. The buffers of larger ones approach the gigabyte beyond which Taichi is not safe.
 MAX_SIDE = 2048
 # Minimum capacity on backends with sparse storage. It equals that of a run, so that the run's cached kernels are

@@ -17,8 +17,6 @@ from modp_ti.outputs.playback.finished_run import FinishedRun
 from modp_ti.outputs.playback.run_pictures import kept_images, pictures
 from modp_ti.outputs.progress import ProgressLine
 
-__all__ = ["dataset_names", "grey_images", "write_images"]
-
 
 def dataset_names(run: FinishedRun) -> list[str]:
     """Return the PNG names of the run's images in a data set, by position."""

@@ -15,8 +15,6 @@ from modp_ti.outputs.progress import ProgressLine
 from pipelines.optimise.adam import Adam, LearningRates
 from pipelines.optimise.gpu_losses import photometric_loss
 
-__all__ = ["with_plain_colours"]
-
 # Maximum number of views to fit, evenly spaced over the frames.
 VIEWS = 60
 STEPS = 900

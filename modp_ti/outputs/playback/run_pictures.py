@@ -20,8 +20,6 @@ from modp_ti.inputs.sources import FrameReader, Picture, Undistorter
 from modp_ti.inputs.sources.intrinsics import Intrinsics
 from modp_ti.outputs.playback.finished_run import FinishedRun, open_run
 
-__all__ = ["kept_images", "pictures", "run_settings"]
-
 Preparing = Callable[[str, int, int], None]
 
 

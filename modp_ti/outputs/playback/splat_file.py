@@ -16,8 +16,6 @@ from modp_ti.outputs.formats.splats_ply import read_splats
 from modp_ti.outputs.playback.camera_paths import looking_at
 from modp_ti.outputs.playback.finished_run import FinishedRun
 
-__all__ = ["SplatFile", "open_splats"]
-
 # Quantile of the distances from the centre that counts as the map's radius.
 RADIUS = 0.8
 # From where the camera looks at the centre, in radii: above and in front of it, with y down and z ahead.

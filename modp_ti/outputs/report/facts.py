@@ -18,20 +18,6 @@ from modp_ti.config.settings import SceneConfig
 from modp_ti.files.urls import without_secrets
 from modp_ti.version import __version__
 
-__all__ = [
-    "changed_settings",
-    "good_figures",
-    "headline",
-    "last_stage",
-    "machine",
-    "other_figures",
-    "remarks",
-    "scene_folders",
-    "shareable",
-    "shown",
-    "stages",
-]
-
 PACKAGES = {"PyTorch": "torch", "NumPy": "numpy", "OpenCV": "opencv-python-headless"}
 STAGES = {
     "compile": "compiling kernels",

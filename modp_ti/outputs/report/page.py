@@ -23,20 +23,6 @@ from modp_ti.outputs.report import facts, plots
 from modp_ti.outputs.report.plots import floor_plan, plan_of
 from modp_ti.outputs.report.record import RunRecord
 
-__all__ = [
-    "FULL_SCALE",
-    "Album",
-    "Comparison",
-    "ReportedRun",
-    "as_uri",
-    "data_uri",
-    "error_colours",
-    "error_map",
-    "picked",
-    "show_link_to_map",
-    "write_report",
-]
-
 # Error at which the colour scale ends.
 FULL_SCALE = 0.2
 # Number of frames shown, and how many of them are the worst ones. The others are spread evenly over the ranks up to the

@@ -21,21 +21,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = [
-    "Plan",
-    "binned",
-    "floor_plan",
-    "frame_rate",
-    "growth",
-    "pace",
-    "plan_of",
-    "pose_changes",
-    "psnr_of_frames",
-    "shifts_and_turns",
-    "steps",
-    "trajectory",
-]
-
 # Maximum number of points of a curve. More would not be visible.
 MOST_POINTS = 400
 # Maximum number of Gaussians drawn, and their minimum opacity.

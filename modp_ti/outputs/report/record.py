@@ -15,8 +15,6 @@ from pipelines.pipeline import FrameReport, Pipeline
 if TYPE_CHECKING:
     from pipelines.pipeline import FrameReport
 
-__all__ = ["WINDOW", "FrameNote", "RunRecord", "StepNote", "mapped_psnr", "retention"]
-
 # Keyframes in a row over which the worst change is averaged.
 WINDOW = 20
 

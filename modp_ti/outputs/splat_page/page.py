@@ -20,8 +20,6 @@ from modp_ti.outputs.playback.camera_paths import smoothed
 from modp_ti.outputs.playback.finished_run import FinishedRun
 from pipelines.render.spherical_harmonics import sh_rotation
 
-__all__ = ["Levelled", "level", "moved", "viewer_settings", "write_splat_page", "write_streaming_page"]
-
 # The scene's depth in the page [m].
 DEPTH = 3.0
 # Weight of the cameras' y axes in the direction of gravity. It decides where the x axes leave the pitch open.

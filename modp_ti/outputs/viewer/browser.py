@@ -14,8 +14,6 @@ from modp_ti.outputs.viewer.modes import SPLATS, scale_of
 if TYPE_CHECKING:
     import viser
 
-__all__ = ["FRAME", "KEYFRAMES", "POINTS", "SPLATS_NODE", "Browser"]
-
 # Names of the nodes of the scene by the labels of their boxes.
 KEYFRAMES, FRAME, POINTS, SPLATS_NODE = "/keyframes", "/frame", "/points", "/splats"
 LABELS = {KEYFRAMES: "Keyframes", FRAME: "Current frame", POINTS: "Tracked points"}

@@ -37,8 +37,6 @@ from websockets.http11 import Request, Response
 
 from modp_ti.files.errors import InputError
 
-__all__ = ["Door"]
-
 # Largest message of a browser [bytes]. Those of our page have some hundred.
 LARGEST_MESSAGE = 16 << 10
 # Least time between two messages of a browser [s]. More often, it is read later and not stored.

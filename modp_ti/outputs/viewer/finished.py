@@ -23,8 +23,6 @@ from modp_ti.outputs.viewer.modes import MODES, SPLATS, Photograph, painter, pin
 from modp_ti.outputs.viewer.page import Page, ShownFrame
 from pipelines.whole.hierarchy import Hierarchy
 
-__all__ = ["FinishedViewer"]
-
 # Pictures for a browser are at most this large, or as large as the run's cameras if those are larger [px].
 PICTURE = 1280, 960
 # Way of a camera after which a browser gets the splats of a large map again [scene depths].

@@ -11,8 +11,6 @@ from typing import Generic, TypeVar
 
 from numpy.typing import NDArray
 
-__all__ = ["BrowserCamera", "CostLimit", "Gate", "Latest", "Requests", "ThreadClock"]
-
 # Mapping time [s] whose share can be saved up while nothing is shown.
 SAVED_UP = 60.0
 # Maximum number of browsers that get rendered pictures.

@@ -16,20 +16,6 @@ from modp_ti.outputs.playback.map_renderer import eight_bits
 from modp_ti.outputs.viewer.handover import BrowserCamera
 from pipelines.render.renderer import RenderedView
 
-__all__ = [
-    "MODES",
-    "SPLATS",
-    "Photograph",
-    "Splats",
-    "image_error",
-    "nearest_photograph",
-    "painter",
-    "picture_of",
-    "pinhole_of",
-    "scale_of",
-    "splats_of",
-]
-
 # The browser draws splats itself. The other modes are background pictures from this program's renderer.
 SPLATS = "splats"
 MODES = (SPLATS, "colour", "depth", "opacity", "error")

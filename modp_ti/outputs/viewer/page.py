@@ -20,8 +20,6 @@ from modp_ti.outputs.viewer.modes import MODES, SPLATS, Splats
 if TYPE_CHECKING:
     import viser
 
-__all__ = ["Page", "ShownFrame"]
-
 TITLE = "MODP-Ti"
 # Depth of the scene in page units. The world's units are arbitrary, and browsers store covariances as 16-bit floats.
 DEPTH_ON_PAGE = 4.0

@@ -25,8 +25,6 @@ from pipelines.densify.depth.gaussian_process import (
 from pipelines.settings import DepthSettings
 from pipelines.torch_checkpoint import read_checkpoint, require_entries
 
-__all__ = ["DepthCov", "DepthCovNetwork", "DepthCovWeights", "load_depthcov", "pixel_covariances"]
-
 LEVELS = 5
 # Image sides must be multiples of this, since each level halves the size.
 STRIDE = 2**LEVELS

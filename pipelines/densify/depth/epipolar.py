@@ -16,8 +16,6 @@ from fields.runtime.parallel import HANDED_OUT
 from pipelines.densify.depth.estimate import DepthEstimate, point_depths, unknown_depth
 from pipelines.settings import EpipolarSettings
 
-__all__ = ["EpipolarDepth", "plane_warp", "sub_sample_peak"]
-
 
 def plane_warp(
     camera: PinholeCamera,

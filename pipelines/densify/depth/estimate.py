@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from fields.geometry.se3 import inverse_se3
 from fields.map.keyframe import Keyframe
 
-__all__ = ["DepthEstimate", "DepthEstimator", "FusedDepth", "misplacement", "point_depths", "unknown_depth"]
-
 
 @dataclass(frozen=True)
 class DepthEstimate:

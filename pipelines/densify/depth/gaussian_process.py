@@ -14,17 +14,6 @@ from fields.map.keyframe import Keyframe
 from pipelines.densify.depth.estimate import DepthEstimate, point_depths, unknown_depth
 from pipelines.settings import DepthSettings
 
-__all__ = [
-    "MIN_POINTS",
-    "GaussianProcessDepth",
-    "ImageGuidedDepth",
-    "conditioning_points",
-    "matern32",
-    "nonstationary_matern32",
-    "nonstationary_variance",
-    "regress_log_depth",
-]
-
 EPSILON = 1e-8
 
 

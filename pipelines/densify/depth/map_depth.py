@@ -12,8 +12,6 @@ from fields.map.keyframe import Keyframe
 from pipelines.densify.depth.estimate import DepthEstimate, point_depths, unknown_depth
 from pipelines.render.renderer import Renderer
 
-__all__ = ["MapDepth"]
-
 
 class MapDepth:
     """Expected depth of the render, where the map is opaque.

@@ -14,8 +14,6 @@ from pipelines.densify.depth.map_depth import MapDepth
 from pipelines.render.renderer import Renderer
 from pipelines.settings import DepthSettings
 
-__all__ = ["build_depth"]
-
 
 def build_depth(settings: DepthSettings, renderer: Renderer, near: float, rng: np.random.Generator) -> DepthEstimator:
     """Build the estimator of `settings.sources`, or the fusion of several.

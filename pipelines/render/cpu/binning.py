@@ -15,8 +15,6 @@ from fields.runtime.engine import ti
 from fields.runtime.parallel import HANDED_OUT
 from pipelines.render.cpu.projection import ALPHA_MIN
 
-__all__ = ["CHUNKS", "Binning", "ellipse_span"]
-
 CHUNKS = 16
 # One of these chunks per scheduling chunk, see `fields.runtime.parallel`.
 SPREAD = HANDED_OUT

@@ -20,8 +20,6 @@ from fields.runtime.parallel import HANDED_OUT
 from pipelines.render.cpu.fast_exp2 import LOG2E, fast_exp2
 from pipelines.render.cpu.projection import ALPHA_MIN
 
-__all__ = ["ALPHA_MAX", "OPAQUE", "Compositing"]
-
 ALPHA_MAX = 0.99
 # A tile stops once the transmittance is below this at all of its pixels, which affects neither 8 bits nor the tests.
 OPAQUE = 1e-5

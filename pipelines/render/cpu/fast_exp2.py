@@ -3,8 +3,6 @@
 
 from fields.runtime.engine import ti
 
-__all__ = ["LOG2E", "fast_exp2"]
-
 LOG2E = 1.4426950408889634
 
 

@@ -17,8 +17,6 @@ from fields.runtime.compiled_kernel import CompiledKernel
 from fields.runtime.engine import ti
 from fields.runtime.parallel import HANDED_OUT
 
-__all__ = ["IDENTITY", "PhotometricModel"]
-
 IDENTITY = np.eye(3, 4)
 IDENTITY.flags.writeable = False
 # Eight rows per chunk, see `fields.runtime.parallel`.

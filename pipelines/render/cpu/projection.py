@@ -22,8 +22,6 @@ from fields.runtime.engine import ti
 from fields.runtime.parallel import HANDED_OUT
 from pipelines.render.spherical_harmonics import add_sh_gradient, evaluate_sh
 
-__all__ = ["ALPHA_MIN", "BLUR", "Projection"]
-
 # Variance of the pixel's footprint, added to every ellipse [px^2].
 BLUR = 0.3
 # Contributions below this are not drawn, as in other splatting renderers.

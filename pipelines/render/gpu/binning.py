@@ -14,8 +14,6 @@ from fields.runtime.compiled_kernel import CompiledKernel
 from fields.runtime.engine import ti
 from pipelines.render.cpu.binning import Binning
 
-__all__ = ["DeviceBinning"]
-
 # The room for pairs is MARGIN times the largest total of the last MEMORY views. A view with more pairs loses its
 # farthest ones.
 MARGIN, MEMORY = 1.5, 64

@@ -31,8 +31,6 @@ from pipelines.render.gpu.compositing_gradient import (
 )
 from pipelines.render.gpu.reductions import THREADS, max_over_block
 
-__all__ = ["DeviceCompositing"]
-
 # Number of Gaussians in shared memory at a time in the forward pass; the backward pass has `STEP`.
 BATCH = TILE_PIXELS
 TILE_BITS = TILE_PIXELS.bit_length() - 1

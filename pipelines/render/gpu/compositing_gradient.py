@@ -15,20 +15,6 @@ from fields.runtime.engine import ti
 from pipelines.render.cpu.compositing import ALPHA_MAX, OPAQUE
 from pipelines.render.cpu.projection import ALPHA_MIN
 
-__all__ = [
-    "COLUMNS",
-    "ROW_BITS",
-    "STEP",
-    "SUMS",
-    "WIDTH",
-    "add_columns",
-    "clear_pairs",
-    "column_sums",
-    "row_bits",
-    "unclamped_alpha",
-    "write_weights",
-]
-
 # Number of Gaussians in shared memory at a time.
 STEP = 16
 # Values of a Gaussian in shared memory: mean (2), conic (3), opacity, colour (3), depth.

@@ -12,8 +12,6 @@ from fields.runtime.engine import ti
 from pipelines.render.cpu.photometric_model import PhotometricModel
 from pipelines.render.gpu.reductions import THREAD_BITS, THREADS, BlockSums, sum_over_block
 
-__all__ = ["DevicePhotometricModel"]
-
 NUMBERS = ti.types.ndarray(dtype=ti.f32, ndim=1)
 
 

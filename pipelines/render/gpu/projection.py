@@ -14,8 +14,6 @@ from fields.runtime.engine import ti
 from pipelines.render.cpu.projection import Projection
 from pipelines.render.gpu.reductions import THREAD_BITS, THREADS, sum_over_block
 
-__all__ = ["DeviceProjection"]
-
 # Sorts after every depth. Not infinity, since Taichi's fast-math assumes that there is none.
 UNSEEN = 3e38
 # Number of blocks that sum the slots' tangents. The host adds their sums, which saves a launch.

@@ -10,8 +10,6 @@ import torch
 from fields.runtime.compiled_kernel import CompiledKernel
 from fields.runtime.engine import ti
 
-__all__ = ["THREADS", "THREAD_BITS", "BlockSums", "max_over_block", "sum_over_block"]
-
 # Threads of every block that reduces. Down to the last warp, both halves at each level of the sum are whole warps.
 THREADS = 256
 THREAD_BITS = THREADS.bit_length() - 1

@@ -10,8 +10,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["MjpegCamera", "encoded"]
-
 
 def encoded(image: NDArray[np.uint8]) -> bytes:
     """An image (H, W, 3) BGR as JPEG."""

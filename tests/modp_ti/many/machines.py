@@ -8,8 +8,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-__all__ = ["made_cluster", "other_machine"]
-
 
 def made_cluster() -> Any:
     """A cluster of a head, which runs no calls, and two machines of one core. Whoever makes it shuts it down."""

@@ -15,8 +15,6 @@ from modp_ti.inputs.opening import open_tracker
 from modp_ti.inputs.replay import ReplayedTracker
 from tests.captures import View
 
-__all__ = ["Opened"]
-
 Opened = Callable[..., ReplayedTracker]
 
 

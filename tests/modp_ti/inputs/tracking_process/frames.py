@@ -7,8 +7,6 @@ import numpy as np
 from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from fields.geometry.camera import PinholeCamera
 
-__all__ = ["assert_same", "random_frame"]
-
 
 def random_frame(index: int, width: int = 50, height: int = 46, masked: bool = False, points: int = 5) -> TrackedFrame:
     rng = np.random.default_rng(index)
