@@ -141,8 +141,8 @@ def test_figures_are_of_held_out_frames_or_else_of_all(make_metrics: Callable[..
     assert tables.quality(section) == {"psnr": 24.0, "ssim": 0.6, "lpips": None}
     section["held_out"]["count"] = 0
     assert tables.quality(section)["psnr"] == 25.0
-    lines = ["index,name,held_out,stage,psnr,ssim,lpips"]
-    lines += [f"{i},f{i}.png,{int(i in (0, 1, 8))},online,{10 + i},0.5," for i in reversed(range(9))]
+    lines = ["index,name,held_out,stage,psnr,ssim,lpips,detail"]
+    lines += [f"{i},f{i}.png,{int(i in (0, 1, 8))},online,{10 + i},0.5,," for i in reversed(range(9))]
     (tmp_path / "scores.csv").write_text("\n".join(lines) + "\n")
     assert tables.first_third_psnr(tmp_path / "scores.csv", "online") == 10.5, "of the first three frames"
     (tmp_path / "scores.csv").write_text("\n".join(lines).replace(",1,online", ",0,online"))

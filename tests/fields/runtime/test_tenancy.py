@@ -20,6 +20,7 @@ from pipelines.online import OnlineMapper
 from pipelines.refinement import refine
 from pipelines.render.renderer import Renderer
 from pipelines.settings import MappingSettings, RefineSettings
+from pipelines.state import save_state
 from tests.pipelines.wall import frame
 
 CAMERA = PinholeCamera(16.0, 16.0, 8.0, 8.0, 16, 16)
@@ -76,7 +77,7 @@ USES: dict[str, Callable[[], Callable[[], object]]] = {
     "backward": lambda: Renderer(gaussians(), 16, 16).backward,
     "frame": lambda: partial(mapper().process, frame(0)),
     "refinement": lambda: partial(refine, mapper(), RefineSettings()),
-    "state": lambda: mapper().state,
+    "state": lambda: partial(save_state, mapper()),
 }
 
 
