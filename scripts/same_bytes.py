@@ -16,14 +16,13 @@ import sys
 import tempfile
 import time
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
 from pathlib import Path
 
 from ending import documented_ending
+from versions import ROOT, checked_out
 
 from modp_ti.files.errors import InputError
 
-ROOT = Path(__file__).resolve().parent.parent
 DATA = ROOT.parent / "shared" / "data"
 QUICK = ["device=cpu", "mapping.optimise.steps=4", "refine.steps=40", "source.holdout=8"]
 DESK = [f"source.path={DATA}/desk/images", f"tracker.path={DATA}/desk/sparse/0", *QUICK]
@@ -99,13 +98,8 @@ def main() -> None:
     options = argparse.ArgumentParser(description=__doc__, epilog="example: scripts/same_bytes HEAD~3")
     options.add_argument("base", metavar="BASE", help="the commit to compare with")
     base = options.parse_args().base
-    with ExitStack() as held:
-        folder = Path(held.enter_context(tempfile.TemporaryDirectory(prefix="same-bytes-")))
-        checkout = ["git", "-C", str(ROOT), "worktree"]
-        if subprocess.run([*checkout, "add", "--detach", "-f", folder / "base", base], capture_output=True).returncode:
-            raise InputError(f"{base} is no commit of this repository")
-        held.callback(subprocess.run, [*checkout, "remove", "--force", folder / "base"], check=True)
-        versions = Version(folder / "base", folder / "before"), Version(ROOT, folder / "after")
+    with checked_out(base) as (_, tree), tempfile.TemporaryDirectory(prefix="same-bytes-") as folder:
+        versions = Version(tree, Path(folder) / "before"), Version(ROOT, Path(folder) / "after")
         before, after = ThreadPoolExecutor(2).map(Version.all, versions)
     names = sorted({*before, *after})
     for name in names:

@@ -159,22 +159,17 @@ def play(
     from modp_ti.config.scene_file import load_scene
     from modp_ti.inputs.opening import open_tracker
 
-    config = load_scene(scene, overrides)
-    tracker = open_tracker(config)
-    waiting: deque = deque()
+    tracker = open_tracker(load_scene(scene, overrides))
+    waiting: deque = deque()  # what `Sender.pose` takes, of the frames that were sent without their poses
     next_time = time.monotonic()
     sender: Sender | None = None
     camera = None
-
-    def send_poses(kept: int) -> None:
-        while sender is not None and len(waiting) > kept:
-            sender.pose(*waiting.popleft())
-
     try:
         for event in tracker:
             if isinstance(event, PoseCorrection):
                 assert sender is not None, "frames come before their corrections"
-                send_poses(0)  # the frames that it revises must have poses
+                while waiting:  # the frames that it revises must have poses
+                    sender.pose(*waiting.popleft())
                 sender.correction(event.index, event.T_camera_world, event.ids, event.xyz)
                 continue
             if sender is None:  # connect late, as the server drops silent clients
@@ -186,15 +181,17 @@ def play(
             if rate is not None:
                 time.sleep(max(next_time - time.monotonic(), 0.0))
                 next_time = max(next_time + 1.0 / rate, time.monotonic())
-            image, points = event.rgba.tobytes(), (event.points.xyz, event.points.pixels, event.points.ids)
+            placed = event.T_camera_world, (event.points.xyz, event.points.pixels, event.points.ids)
+            sender.frame(event.index, event.timestamp, event.rgba.tobytes(), *(() if late else placed))
             if late:
-                sender.frame(event.index, event.timestamp, image)
-                waiting.append((event.index, event.T_camera_world, points))
-                send_poses(late)
-            else:
-                sender.frame(event.index, event.timestamp, image, event.T_camera_world, points)
-        send_poses(0)
-        return 0 if sender is None else sender.end()
+                waiting.append((event.index, *placed))
+                if len(waiting) > late:
+                    sender.pose(*waiting.popleft())
+        if sender is None:
+            return 0
+        while waiting:
+            sender.pose(*waiting.popleft())
+        return sender.end()
     finally:
         tracker.close()
 

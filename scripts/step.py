@@ -20,7 +20,6 @@ from fields.runtime.engine import ti
 from modp_ti.engine.run_clock import peak_memory_mb
 from pipelines.optimise.adam import LearningRates
 from pipelines.optimise.map_optimiser import MapOptimiser
-from pipelines.render.compositing_reference import ReferenceCompositing
 from pipelines.render.renderer import Renderer
 from pipelines.settings import MappingSettings
 
@@ -139,7 +138,7 @@ def measure_machine(device: str, threads: int) -> dict[str, float]:
     }
 
 
-def measure_step(device: str, threads: int, size: Size, repeats: int, twin: bool = False) -> dict[str, float]:
+def measure_step(device: str, threads: int, size: Size, repeats: int) -> dict[str, float]:
     """Measure the stages and the whole step on one view.
 
     Args:
@@ -147,7 +146,6 @@ def measure_step(device: str, threads: int, size: Size, repeats: int, twin: bool
         threads: Number of CPU threads.
         size: Size of the scene.
         repeats: Number of timed calls.
-        twin: Also time the plain pixel-outer compositing that the tests compare with (CPU only).
 
     Returns:
         Time of each of STAGES and of a whole `step` [ms], counts of pairs, `peak_memory_mb` and `cores_had`. The last
@@ -180,13 +178,10 @@ def measure_step(device: str, threads: int, size: Size, repeats: int, twin: bool
     figures: dict[str, Any] = milliseconds(dict(zip(STAGES, calls, strict=True)), repeats)
     figures["visible"] = renderer.projected.seen[None]  # on a GPU, `count` is only an upper bound
     # On a GPU, one thread per pixel visits whole tiles.
-    figures["pairs visited"] = figures["pairs of whole tiles"] = pairs.count * TILE_PIXELS
+    figures["pairs visited"] = pairs.count * TILE_PIXELS
     if on_cpu:
         rows = pairs.rows_to_numpy()
         figures["pairs visited"] = int(((rows >> 16) - (rows & 0xFFFF)).sum()) * TILE_WIDTH
-    if on_cpu and twin:
-        plain = ReferenceCompositing(renderer.view, renderer.projected, pairs, renderer.images)
-        figures |= milliseconds({"twin": plain.forward, "twin backward": plain.backward}, min(repeats, 5))
     wall, busy = time.perf_counter(), time.process_time()
     figures |= milliseconds({"step": lambda: optimiser.step(store, [0], still, pose_rate=0.0)}, repeats)
     figures["cores_had"] = (time.process_time() - busy) / (time.perf_counter() - wall)

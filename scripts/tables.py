@@ -91,7 +91,7 @@ def main() -> None:
     comparison = which.add_parser("compare", help="the online map, its post refinement, and offline 3DGS")
     comparison.set_defaults(tables=compare)
     comparison.add_argument(
-        "--steps", nargs="+", type=_positive, default=[1000], help="post refinements, a run for each (default 1000)"
+        "--steps", nargs="+", type=int, default=[1000], help="post refinements, a run for each (default 1000)"
     )
     comparison.add_argument("--no-offline", action="store_true", help="leave offline 3DGS out")
     for parser in (ablation, comparison):
@@ -103,27 +103,15 @@ def main() -> None:
     arguments.tables(arguments)
 
 
-def _positive(text: str) -> int:
-    if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"{text} must be positive: the online map is a row in any case")
-    return int(text)
-
-
 def ablate(options: argparse.Namespace) -> None:
     """Print and write the paper's ablations."""
     scenes = named_scenes(options.scenes)
     if options.tracker and len(options.tracker) != len(scenes):
         raise InputError(f"--tracker needs one file for each of the {len(scenes)} scenes, got {len(options.tracker)}")
     common = {"refine.steps": str(options.refine)} | command_line(options.set)
-    runs: dict[tuple[str, str], SceneConfig] = {}
-    for place, (scene, file) in enumerate(scenes.items()):
-        for variant in options.only or VARIANTS:
-            runs[scene, variant] = settings_of(
-                file, options.output / scene / _folder(variant), common | VARIANTS[variant]
-            )
-        if options.tracker:
-            other = Path(options.tracker[place])
-            runs[scene, OTHER_TRACKER] = settings_of(other, options.output / scene / _folder(OTHER_TRACKER), common)
+    variants = {name: common | VARIANTS[name] for name in options.only or VARIANTS}
+    others = dict(zip(scenes, map(Path, options.tracker), strict=False))
+    runs = runs_of(scenes, options.output, variants) | runs_of(others, options.output, {OTHER_TRACKER: common})
     figures: dict[str, dict[str, Figures]] = {scene: {} for scene in scenes}
     for (scene, variant), metrics in execute(runs, options.output, options.fresh).items():
         stage = "refined" if metrics.get("refined") else "online"
@@ -149,48 +137,31 @@ def ablation_report(figures: Mapping[str, Mapping[str, Figures]]) -> str:
 def compare(options: argparse.Namespace) -> None:
     """Print and write the comparison. Offline 3DGS gets as many view renders as the run with the first refinement."""
     scenes, common, output = named_scenes(options.scenes), command_line(options.set), options.output
-    refinements = list(dict.fromkeys(options.steps))
-    online = {
-        (scene, f"refined-{steps}"): settings_of(
-            file, output / scene / f"refined-{steps}", common | {"refine.steps": steps}
-        )
-        for scene, file in scenes.items()
-        for steps in refinements
-    }
+    if min(options.steps) < 1:
+        raise InputError("--steps must be positive: the online map is a row in any case")
+    refined = {f"refined-{steps}": steps for steps in options.steps}
+    online = runs_of(scenes, output, {name: common | {"refine.steps": steps} for name, steps in refined.items()})
     offline = common | {"mode": "offline"}
-    if not options.no_offline:
-        for scene, file in scenes.items():  # reports bad settings before the first run, which may take hours
-            settings_of(file, output / scene / "offline", offline)
+    runs_of(
+        {} if options.no_offline else scenes, output, {OFFLINE: offline}
+    )  # reports bad settings before hours of runs
     done = execute(online, output, options.fresh)
     figures: dict[str, dict[str, Figures]] = {}
     breakdown: dict[str, Figures] = {}
-    for scene in scenes:
-        of_scene = [done[scene, f"refined-{steps}"] for steps in refinements]
-        figures[scene] = online_rows(of_scene, refinements)
-        percent = of_scene[0]["breakdown_percent"]
-        breakdown[scene] = {label: percent[stage] for label, stage in BREAKDOWN.items()} | {
-            "FPS": of_scene[0]["frames_per_second"]
-        }
-    if not options.no_offline:
-        renders = {scene: done[scene, f"refined-{refinements[0]}"]["refined"]["view_renders"] for scene in scenes}
-        runs = {
-            (scene, "offline"): settings_of(
-                file, output / scene / "offline", offline | {"offline.steps": renders[scene]}
-            )
-            for scene, file in scenes.items()
-        }
-        for (scene, _), metrics in execute(runs, output, options.fresh).items():
-            figures[scene][OFFLINE] = _row(metrics, "offline", renders[scene])
+    for scene, file in scenes.items():
+        of_scene = {steps: done[scene, name] for name, steps in refined.items()}
+        first = next(iter(of_scene.values()))
+        figures[scene] = {ONLINE: _row(first, "online", 0)}
+        figures[scene] |= {f"{ONLINE} + {steps:,} steps": _row(of, "refined", steps) for steps, of in of_scene.items()}
+        breakdown[scene] = {label: first["breakdown_percent"][stage] for label, stage in BREAKDOWN.items()}
+        breakdown[scene] |= {"FPS": first["frames_per_second"]}
+        if not options.no_offline:
+            renders = first["refined"]["view_renders"]
+            run = runs_of({scene: file}, output, {OFFLINE: offline | {"offline.steps": renders}})
+            (metrics,) = execute(run, output, options.fresh).values()
+            figures[scene][OFFLINE] = _row(metrics, "offline", renders)
     text = comparison_report(figures, breakdown)
     write_report(output, "comparison", text, {"quality": figures, "breakdown_percent": breakdown})
-
-
-def online_rows(runs: Sequence[Mapping[str, Any]], refinements: Sequence[int]) -> dict[str, Figures]:
-    """Return the rows of the online map and of each post refinement, given the metrics and steps of the runs."""
-    rows: dict[str, Figures] = {ONLINE: _row(runs[0], "online", 0)}
-    for metrics, steps in zip(runs, refinements, strict=True):
-        rows[f"{ONLINE} + {steps:,} steps"] = _row(metrics, "refined", steps)
-    return rows
 
 
 def _row(metrics: Mapping[str, Any], stage: str, steps: int) -> Figures:
@@ -249,6 +220,17 @@ def settings_of(scene: Path, folder: Path, overrides: Mapping[str, Any]) -> Scen
     # JSON is valid YAML, whatever characters the path contains.
     overrides = {**overrides, "output": json.dumps(str(folder.resolve()))}
     return load_scene(scene, [f"{key}={value}" for key, value in overrides.items()])
+
+
+def runs_of(
+    scenes: Mapping[str, Path], output: Path, variants: Mapping[str, Mapping[str, Any]]
+) -> dict[tuple[str, str], SceneConfig]:
+    """Return the settings of the runs of each scene with each variant's overrides, by the names of both."""
+    return {
+        (scene, name): settings_of(file, output / scene / _folder(name), overrides)
+        for scene, file in scenes.items()
+        for name, overrides in variants.items()
+    }
 
 
 def execute(

@@ -6,13 +6,13 @@ import shutil
 from collections.abc import Iterator
 
 import pytest
-import screenshot
 
 from modp_ti.outputs.report.page import write_report
+from tests import chromium
 from tests.modp_ti.outputs.report.made_up_run import made_up_run
 
-if screenshot.missing():
-    pytest.skip(screenshot.missing(), allow_module_level=True)
+if chromium.missing():
+    pytest.skip(chromium.missing(), allow_module_level=True)
 
 pytestmark = [pytest.mark.slow, pytest.mark.browser]
 
@@ -35,9 +35,9 @@ def address(tmp_path_factory) -> str:
 def chromium() -> Iterator:
     from playwright.sync_api import sync_playwright
 
-    executable = next(path for path in map(shutil.which, screenshot.NAMES) if path)
+    executable = next(path for path in map(shutil.which, chromium.NAMES) if path)
     with sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=executable, args=screenshot.OPTIONS)
+        browser = driver.chromium.launch(executable_path=executable, args=chromium.OPTIONS)
         yield browser
         browser.close()
 

@@ -15,7 +15,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import screenshot
 
 from fields.geometry.camera import PinholeCamera
 from modp_ti.outputs.playback.camera_paths import looking_at
@@ -25,10 +24,11 @@ from modp_ti.outputs.playback.map_renderer import MapRenderer
 from modp_ti.outputs.progress import ProgressLine
 from modp_ti.outputs.splat_page.page import TO_VIEWER, level, moved, viewer_settings
 from pipelines.whole.hierarchy import LEVELS
+from tests import chromium
 from tests.patience import PATIENCE
 
-if screenshot.missing():
-    pytest.skip(screenshot.missing(), allow_module_level=True)
+if chromium.missing():
+    pytest.skip(chromium.missing(), allow_module_level=True)
 
 pytestmark = [pytest.mark.slow, pytest.mark.browser]
 
@@ -40,13 +40,11 @@ SHOWN = "() => Boolean(window.viewer && viewer.state.loaded)"
 
 
 @contextmanager
-def opened(
-    url: str, offline: bool, awaited: str = SHOWN, options: Sequence[str] = screenshot.OPTIONS
-) -> Iterator[tuple]:
+def opened(url: str, offline: bool, awaited: str = SHOWN, options: Sequence[str] = chromium.OPTIONS) -> Iterator[tuple]:
     """The open page of a map, what its console said, and what it requested."""
     from playwright.sync_api import sync_playwright
 
-    executable = next(path for path in map(shutil.which, screenshot.NAMES) if path)
+    executable = next(path for path in map(shutil.which, chromium.NAMES) if path)
     with sync_playwright() as driver:
         environment = {name: value for name, value in os.environ.items() if not name.startswith("VK_")}
         browser = driver.chromium.launch(executable_path=executable, args=list(options), env=environment)

@@ -15,15 +15,15 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 import pytest
-import screenshot
 
+from tests import chromium
 from tests.patience import PATIENCE
 
 if TYPE_CHECKING:
     from tests.room import Room
 
-if screenshot.missing():
-    pytest.skip(screenshot.missing(), allow_module_level=True)
+if chromium.missing():
+    pytest.skip(chromium.missing(), allow_module_level=True)
 
 SCENE = """
 source:  {path: images, fps: 10}
@@ -100,7 +100,7 @@ def colourful(page) -> float:
 
 def test_the_page_shows_the_map_and_its_buttons_hold_the_run(run: tuple[subprocess.Popen, str]):
     process, url = run
-    with screenshot.open_page(url) as page:
+    with chromium.open_page(url) as page:
         wait_until(page, lambda: frame_number(page) == 1)
         for number in (2, 3, 4):
             page.get_by_role("button", name="Step").click()
@@ -110,7 +110,7 @@ def test_the_page_shows_the_map_and_its_buttons_hold_the_run(run: tuple[subproce
         # Our renderer's opacity: grey, from where the browser looks.
         for box in ("Keyframes", "Current frame", "Tracked points"):
             page.get_by_role("checkbox", name=box).click()
-        screenshot.choose_mode(page, "opacity")
+        chromium.choose_mode(page, "opacity")
         wait_until(page, lambda: drawn(page) > 0.01 and colourful(page) < 0.001)
 
         page.get_by_role("button", name="Resume").click()
@@ -137,7 +137,7 @@ def shown_lag(page) -> tuple[int, str]:
 def test_the_page_shows_the_lag_that_the_session_records(run: tuple[subprocess.Popen, str], tmp_path: Path):
     process, url = run
     shown: dict[int, str] = {}
-    with screenshot.open_page(url) as page:
+    with chromium.open_page(url) as page:
         wait_until(page, lambda: shown_lag(page)[0] == 1)
         for number in (2, 3, 4, 5):  # the stream goes on meanwhile, so that each frame is later than the one before
             page.get_by_role("button", name="Step").click()
@@ -156,7 +156,7 @@ def test_the_page_shows_the_lag_that_the_session_records(run: tuple[subprocess.P
 
 def test_two_browsers_have_their_own_modes_and_scales(run: tuple[subprocess.Popen, str]):
     process, url = run
-    with screenshot.open_page(url) as page:
+    with chromium.open_page(url) as page:
         wait_until(page, lambda: frame_number(page) == 1)
         for number in (2, 3):
             page.get_by_role("button", name="Step").click()
@@ -164,7 +164,7 @@ def test_two_browsers_have_their_own_modes_and_scales(run: tuple[subprocess.Pope
         other = page.context.browser.new_page(viewport={"width": 390, "height": 844})  # a phone
         other.goto(url)
         wait_until(other, lambda: "Link to this view" in other.locator("body").inner_text())
-        screenshot.choose_mode(other, "depth")
+        chromium.choose_mode(other, "depth")
         wait_until(other, lambda: "scene units" in other.locator("body").inner_text())
         assert "scene units" not in page.locator("body").inner_text()
         assert page.locator("input[role=combobox]:visible").first.input_value() == "splats"

@@ -1,17 +1,12 @@
-"""Take a screenshot of the viewer's page in headless Chromium: `scripts/screenshot URL FILE.png`."""
+"""Pages in headless Chromium."""
 
 from __future__ import annotations
 
-import argparse
 import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
-
-from ending import documented_ending
-
-from modp_ti.files.errors import InputError
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
@@ -68,28 +63,3 @@ def choose_mode(page: Page, mode: str) -> None:
     """Select the display mode."""
     page.locator("input[role=combobox]:visible").first.click()
     page.get_by_role("option", name=mode, exact=True).click()
-
-
-@documented_ending()
-def main() -> None:
-    """Run the command."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("url", help="what `modp-ti run --view` or `modp-ti view` printed")
-    parser.add_argument("file", help="PNG to write")
-    parser.add_argument("--mode", default="splats", help="what the page shows")
-    parser.add_argument("--wait", type=float, default=15.0, help="seconds for the page to show it")
-    parser.add_argument("--until", help="text in the page that is waited for first, two minutes long: `frame 30`")
-    arguments = parser.parse_args()
-    if lacking := missing():
-        raise InputError(lacking)
-    with open_page(arguments.url) as page:
-        if arguments.until:
-            page.get_by_text(arguments.until).first.wait_for()
-        if arguments.mode != "splats":
-            choose_mode(page, arguments.mode)
-        page.wait_for_timeout(1000 * arguments.wait)
-        page.screenshot(path=arguments.file)
-
-
-if __name__ == "__main__":
-    main()
