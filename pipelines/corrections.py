@@ -8,12 +8,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fields.frames.camera_revision import CameraRevision
-from fields.frames.pose_correction import PoseCorrection
+from fields.frames.pose_correction import CameraRevision, PoseCorrection
 from fields.frames.tracked_frame import SparsePoints
 from fields.geometry.camera import PinholeCamera
-from fields.geometry.se3 import interpolate_se3, inverse_se3, orthonormalised
-from fields.geometry.similarity import motion_around, moved_points, moved_pose, scale_of
+from fields.geometry.se3 import (
+    interpolate_se3,
+    inverse_se3,
+    motion_around,
+    moved_points,
+    moved_pose,
+    orthonormalised,
+    scale_of,
+)
 from fields.map.gaussian_motion import GaussianMotion
 from fields.map.gaussians import NO_ANCHOR
 from fields.map.keyframe import Keyframe

@@ -16,17 +16,15 @@ from fields.map.keyframes import KeyframeStore
 from fields.map.trajectory import Trajectory
 from fields.runtime.tenancy import in_engine, settled
 from pipelines.corrections import CorrectionReport, revise
-from pipelines.densify.adaptive_density import AdaptiveDensity
-from pipelines.densify.point_initialisation import initialise, union_of_points
-from pipelines.offline_settings import OfflineSettings
+from pipelines.densify.adaptive_density import AdaptiveDensity, initialise, union_of_points
 from pipelines.optimise.adam import Adam, LearningRates
 from pipelines.optimise.gpu_losses import photometric_loss
 from pipelines.optimise.losses import LossValues
-from pipelines.optimise.safeguards import EXPLODED, Safeguards
-from pipelines.pipeline import FrameReport, NothingToMapError, Pipeline
+from pipelines.pipeline import FrameReport, NothingToMapError, Pipeline, Stopwatch
 from pipelines.refinement import decay
 from pipelines.render.renderer import Renderer
-from pipelines.stopwatch import Stopwatch
+from pipelines.safeguards import EXPLODED, Safeguards
+from pipelines.settings import OfflineSettings
 
 # Length of the published run, to which the step numbers in the settings refer.
 PUBLISHED_STEPS = 30_000

@@ -17,26 +17,24 @@ from fields.map.trajectory import Trajectory
 from fields.runtime.tenancy import in_engine, settled
 from fields.voxels.sparse_bricks import SparseBricks
 from pipelines.companions.companion import Companion
-from pipelines.companions.hidden_gaussians import HiddenGaussians
+from pipelines.companions.hidden_gaussians import Contribution, HiddenGaussians
 from pipelines.companions.other_places import OtherPlaces
 from pipelines.companions.pace import CompletePace, Pace
 from pipelines.companions.paging import Paging
 from pipelines.companions.transients import TransientSweep
 from pipelines.corrections import CorrectionReport, MapCorrector
-from pipelines.densify.contribution import Contribution
 from pipelines.densify.densifier import Densifier
 from pipelines.densify.depth.estimate import DepthEstimator
 from pipelines.densify.depth.sources import build_depth
 from pipelines.optimise.map_optimiser import MapOptimiser
-from pipelines.optimise.safeguards import Safeguards
-from pipelines.pipeline import FrameReport, Pipeline
+from pipelines.pipeline import FrameReport, Pipeline, Stopwatch
 from pipelines.refinement import finish
 from pipelines.render.renderer import Renderer
+from pipelines.safeguards import Safeguards
 from pipelines.select.gate import FrameGate
 from pipelines.select.keyframes import KeyframeSelector
 from pipelines.select.views import LocalGlobalViews, ViewSelection, global_probabilities
 from pipelines.settings import MappingSettings
-from pipelines.stopwatch import Stopwatch
 from pipelines.warm_up import warm_up
 
 

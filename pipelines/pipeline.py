@@ -1,25 +1,28 @@
-"""`Pipeline`: the common interface of the online mapper and the offline baseline."""
+"""`Pipeline`: the common interface of the online mapper and the offline baseline, and the time of its stages."""
 
 from __future__ import annotations
 
+import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from numpy.typing import NDArray
 
-from fields.frames.pose_correction import PoseCorrection
-from fields.frames.tracked_frame import TrackedFrame
-from fields.map.gaussians import GaussianField
-from fields.map.keyframes import KeyframeStore
-from fields.map.trajectory import Trajectory
-from fields.runtime.tenancy import Tenancy
-from pipelines.companions.transients import TransientSweep
-from pipelines.corrections import CorrectionReport
-from pipelines.optimise.losses import PhotometricLoss
-from pipelines.optimise.safeguards import Safeguards
-from pipelines.render.renderer import Renderer
-from pipelines.stopwatch import Stopwatch
+if TYPE_CHECKING:
+    from fields.frames.pose_correction import PoseCorrection
+    from fields.frames.tracked_frame import TrackedFrame
+    from fields.map.gaussians import GaussianField
+    from fields.map.keyframes import KeyframeStore
+    from fields.map.trajectory import Trajectory
+    from fields.runtime.tenancy import Tenancy
+    from pipelines.companions.transients import TransientSweep
+    from pipelines.corrections import CorrectionReport
+    from pipelines.optimise.losses import PhotometricLoss
+    from pipelines.render.renderer import Renderer
+    from pipelines.safeguards import Safeguards
 
 
 class NothingToMapError(ValueError):
@@ -124,3 +127,42 @@ class Pipeline(ABC):
 
     def count_beside(self, nbytes: int) -> None:  # noqa: B027 - a pipeline without a budget has nothing to count
         """Set the bytes that are kept outside the map and count towards its memory budget."""
+
+
+# The stages of the paper's breakdown: Optim, Cam Select, Depth Est., MOHV.
+BREAKDOWN = ("optimise", "select", "depth", "occupancy")
+
+
+class Stopwatch:
+    """Accumulates wall-clock time by stage.
+
+    Attributes:
+        seconds: Time of each stage [s].
+    """
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def measure(self, stage: str) -> Iterator[None]:
+        """Context manager that adds the time of its block to `stage`."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
+
+
+def breakdown_percent(seconds: Mapping[str, float], total: float) -> dict[str, float]:
+    """Compute the percentage of each stage, as in the paper's breakdown of time.
+
+    Args:
+        seconds: Time of each stage [s].
+        total: Total time of the mapping [s].
+
+    Returns:
+        Percentages of the paper's stages, and of the rest as `others`.
+    """
+    percent = {stage: 100.0 * seconds.get(stage, 0.0) / total for stage in BREAKDOWN}
+    percent["others"] = 100.0 - sum(percent.values())
+    return {stage: round(value, 2) for stage, value in percent.items()}

@@ -27,7 +27,7 @@ from step import SIZES, STAGES, Size
 from tables import Figures, command_line, execute, markdown_table, named_scenes, settings_of, write_report
 from versions import ROOT, checked_out, this_version
 
-from fields.runtime.parallel import available_cores
+from fields.runtime.process import available_cores
 from modp_ti.files.errors import InputError
 
 RUNS = {

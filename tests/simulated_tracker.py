@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import SparsePoints, TrackedFrame
-from fields.geometry.se3 import inverse_se3
-from fields.geometry.similarity import moved_points, moved_pose
+from fields.geometry.se3 import inverse_se3, moved_points, moved_pose
 from tests.room import look_at
 
 SCENE_DEPTH = 2.5  # typical distance of surfaces from the camera [m]

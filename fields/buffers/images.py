@@ -1,22 +1,76 @@
 """`ImageBuffers`: the rendered image, the reference image, and gradients."""
 # pyright: reportInvalidTypeForm=false
 
+import weakref
+from collections import OrderedDict
+
 import numpy as np
 import torch
 
-from fields.buffers.device_images import DeviceImages
 from fields.buffers.tiles import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH
-from fields.runtime.backend import on_gpu
-from fields.runtime.compiled_kernel import CompiledLoop
+from fields.runtime.backend import on_gpu, torch_device
+from fields.runtime.compiled_kernel import HANDED_OUT, CompiledLoop
 from fields.runtime.engine import ti
-from fields.runtime.parallel import HANDED_OUT
+
+
+class DeviceImages:
+    """Cache of device copies of keyframe images, which stay in host memory.
+
+    An image is identified by its array object, whose contents must not change. When the array is garbage collected, its
+    copy is dropped.
+
+    Args:
+        max_bytes: Capacity [bytes].
+
+    Attributes:
+        bytes: Bytes of all copies.
+    """
+
+    def __init__(self, max_bytes: float) -> None:
+        self.max_bytes = max_bytes
+        self.bytes = 0
+        self._device = torch_device()
+        self._copies: OrderedDict[int, tuple[weakref.ref, torch.Tensor]] = OrderedDict()
+
+    def __len__(self) -> int:
+        return len(self._copies)
+
+    def __contains__(self, image: np.ndarray) -> bool:
+        return id(image) in self._copies
+
+    def of(self, image: np.ndarray) -> torch.Tensor:
+        """Return the device copy of a uint8 image, uploading it if necessary. Does not wait for the device."""
+        key = id(image)
+        if key in self._copies:
+            self._copies.move_to_end(key)
+            return self._copies[key][1]
+        copy = self._upload(np.ascontiguousarray(image))
+        self._copies[key] = weakref.ref(image, lambda _: self._drop(key)), copy
+        self.bytes += copy.nbytes
+        while self.bytes > self.max_bytes and len(self._copies) > 1:
+            self._drop(next(iter(self._copies)))
+        return copy
+
+    def _upload(self, image: np.ndarray) -> torch.Tensor:
+        host = torch.from_numpy(image)
+        if self._device.type == "cpu":
+            return host.clone()
+        # A copy from memory that is not pinned would wait for the kernels launched before.
+        pinned = torch.empty(host.shape, dtype=host.dtype, pin_memory=True)
+        pinned.copy_(host)
+        return pinned.to(self._device, non_blocking=True)
+
+    def _drop(self, key: int) -> None:
+        if key in self._copies:
+            self.bytes -= self._copies.pop(key)[1].nbytes
+
 
 # Border of zeros around every plane [px]. An 11x11 window reads 5 px beyond the image without a branch.
 PAD = 8
 # The loss works on strips of rows in parallel, with separate scratch rows for each channel of a strip.
 STRIPS = 32
 SCRATCH_ROWS = 8
-# Eight rows per chunk, see `fields.runtime.parallel`.
+# Eight rows per chunk, see `fields.runtime.compiled_kernel`.
 SPREAD = HANDED_OUT // 8
 
 

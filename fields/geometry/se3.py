@@ -1,7 +1,8 @@
-"""SE(3): rigid motions and their tangents in NumPy, one of them also in PyTorch.
+"""SE(3): rigid motions and their tangents in NumPy, one of them also in PyTorch; similarities.
 
 The tangent is xi = (rho, omega): translation first, then rotation. Increments act on the left, T <- exp(xi) T, so that
-the tangent of a `T_camera_world` is expressed in the camera frame.
+the tangent of a `T_camera_world` is expressed in the camera frame. A similarity is a matrix S_after_before (4, 4),
+x -> s R x + t.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 if TYPE_CHECKING:
     import torch
+
 
 # Below this angle [rad], the closed forms lose precision and their series are exact to rounding.
 SMALL_ANGLE = 1e-4
@@ -159,3 +161,39 @@ def torch_exp_se3(xi: torch.Tensor) -> torch.Tensor:
     a, b, c, x, y, z = xi.unbind(-1)
     rows = [(zero, -z, y, a), (z, zero, -x, b), (-y, x, zero, c), (zero, zero, zero, zero)]
     return torch.linalg.matrix_exp(torch.stack([torch.stack(row, -1) for row in rows], -2))
+
+
+def scale_of(S: ArrayLike) -> NDArray[np.float64]:
+    """Scale s of a similarity (4, 4), or scales (N,) of N similarities (N, 4, 4)."""
+    return np.cbrt(np.linalg.det(np.asarray(S, dtype=np.float64)[..., :3, :3]))
+
+
+def motion_around(T_before: ArrayLike, T_after: ArrayLike, scale: float = 1.0) -> NDArray[np.float64]:
+    """Similarity of the world around a camera whose pose is revised.
+
+    In the camera frame, everything keeps its direction and moves to `scale` times its distance.
+
+    Args:
+        T_before: Former pose T_camera_world (4, 4).
+        T_after: Revised pose T_camera_world (4, 4).
+        scale: Change of scale.
+
+    Returns:
+        S_after_before (4, 4), exactly the identity if the poses are bit-identical and the scale is 1.
+    """
+    if scale == 1.0 and np.array_equal(T_before, T_after):
+        return np.eye(4)
+    return inverse_se3(T_after) @ np.diag([scale, scale, scale, 1.0]) @ np.asarray(T_before, dtype=np.float64)
+
+
+def moved_pose(S: NDArray[np.float64], T_camera_world: NDArray[np.float64]) -> NDArray[np.float64]:
+    """T_camera_world (4, 4) of a camera that moves with the world by S (4, 4), so that its image stays the same."""
+    if np.array_equal(S, np.eye(4)):
+        return T_camera_world.copy()
+    s = float(scale_of(S))
+    return orthonormalised(np.diag([s, s, s, 1.0]) @ T_camera_world @ np.linalg.inv(S))
+
+
+def moved_points(S: NDArray[np.float64], xyz: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Apply a similarity S (4, 4) to points (N, 3)."""
+    return xyz.copy() if np.array_equal(S, np.eye(4)) else xyz @ S[:3, :3].T + S[:3, 3]

@@ -4,8 +4,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from fields.geometry.se3 import quaternion_from_matrix
-from fields.geometry.similarity import scale_of
+from fields.geometry.se3 import quaternion_from_matrix, scale_of
 from fields.map.gaussians import GaussianField
 from fields.runtime.engine import ti
 

@@ -9,12 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fields.frames.camera_revision import CameraRevision
-from fields.frames.pyramid import ImageLevel, build_pyramid
-from fields.frames.tracked_frame import SparsePoints
+from fields.frames.pose_correction import CameraRevision
+from fields.frames.tracked_frame import ImageLevel, SparsePoints, build_pyramid
 from fields.geometry.camera import PinholeCamera
-from fields.geometry.se3 import inverse_se3, orthonormalised
-from fields.geometry.similarity import moved_points, scale_of
+from fields.geometry.se3 import inverse_se3, moved_points, orthonormalised, scale_of
 from fields.map.trajectory import Trajectory
 
 

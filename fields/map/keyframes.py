@@ -8,9 +8,8 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from fields.frames.camera_revision import CameraRevision
-from fields.frames.pyramid import ImageLevel
-from fields.frames.tracked_frame import SparsePoints, TrackedFrame
+from fields.frames.pose_correction import CameraRevision
+from fields.frames.tracked_frame import ImageLevel, SparsePoints, TrackedFrame
 from fields.geometry.se3 import camera_centres, interpolate_se3
 from fields.map.keyframe import Keyframe, median_depth_of, nbytes_of
 from fields.map.trajectory import Trajectory

@@ -12,11 +12,10 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from fields.runtime.device_check import computes_rightly
 from fields.runtime.engine import configuration, engine, forget_arrays, lock, running_program, start, ti
+from fields.runtime.gpus import VulkanDevice, choose, computes_rightly, vulkan_devices
 from fields.runtime.kernel_sources import answer_quickly
 from fields.runtime.process import pin_workers, threads_of_process
-from fields.runtime.vulkan_devices import VulkanDevice, choose, vulkan_devices
 
 answer_quickly()  # at import, since most of the time that it saves goes into the definitions of kernels
 

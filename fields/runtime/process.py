@@ -102,6 +102,11 @@ def provide_cache(package: str) -> None:
     )
 
 
+def available_cores() -> int:
+    """Return the number of cores on which this process may run."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 TASKS = Path("/proc/self/task")
 
 

@@ -5,8 +5,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.runtime.backend import on_gpu, refuse_too_many_fields, sparse
+from fields.runtime.compiled_kernel import HANDED_OUT
 from fields.runtime.engine import ti
-from fields.runtime.parallel import HANDED_OUT
 from fields.voxels.bricks import (
     BRICK_LEVELS,
     BRICKS,

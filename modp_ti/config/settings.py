@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field, SerializationInfo, field_serializer, field_validator, model_validator
 
-from fields.runtime.parallel import available_cores
+from fields.runtime.process import available_cores
 from modp_ti.config.camera_settings import BagImagesSettings, IntrinsicsSettings, PanoramaSettings, VrsSettings
 from modp_ti.config.combinations import refuse_exclusions
 from modp_ti.config.output_settings import EvaluationSettings, ExportSettings, ViewSettings
@@ -22,8 +22,7 @@ from modp_ti.files.errors import InputError
 from modp_ti.files.urls import shown_url
 from modp_ti.inputs.reader import TrackerSettings
 from modp_ti.inputs.readers import READERS, SOURCES
-from pipelines.offline_settings import OfflineSettings
-from pipelines.settings import MappingSettings, RefineSettings, StrictModel
+from pipelines.settings import MappingSettings, OfflineSettings, RefineSettings, StrictModel
 
 __all__ = [
     "LONGER_SIDE",

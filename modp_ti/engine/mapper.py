@@ -27,12 +27,11 @@ from pipelines.companions.block_files import BlockError
 from pipelines.companions.changes import ChangeSweep, EarlierVisit
 from pipelines.companions.pace import Pace
 from pipelines.offline import OfflineMapper
-from pipelines.offline_settings import OfflineSettings
 from pipelines.online import OnlineMapper
 from pipelines.pipeline import FrameReport, NothingToMapError, Pipeline
 from pipelines.refinement import Schedule, refine
 from pipelines.render.renderer import RenderedView
-from pipelines.settings import MappingSettings, RefineSettings
+from pipelines.settings import MappingSettings, OfflineSettings, RefineSettings
 from pipelines.state import MapState, restore_state, save_state
 from pipelines.whole.finished_map import FinishedMap, go_on
 from pipelines.whole.merge import MappedPart, merge

@@ -20,7 +20,7 @@ from modp_ti.engine.prefetch import FramesAhead
 from modp_ti.engine.recording import FILE, SessionRecorder
 from modp_ti.inputs.protocol import Event, LiveCounts, Tracker
 from modp_ti.outputs.progress import LiveStatus
-from pipelines.companions.realtime_pace import RealtimePace
+from pipelines.companions.pace import RealtimePace
 from pipelines.pipeline import FrameReport
 from pipelines.refinement import Schedule
 from pipelines.settings import MappingSettings, RefineSettings

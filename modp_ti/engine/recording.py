@@ -17,8 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fields.frames.camera_revision import CameraRevision
-from fields.frames.pose_correction import PoseCorrection
+from fields.frames.pose_correction import CameraRevision, PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from modp_ti.engine.conductor import Conductor
@@ -30,8 +29,7 @@ from modp_ti.files.reading import reading
 from modp_ti.inputs.frame_record import FrameRecord
 from modp_ti.inputs.protocol import Event, Tracker
 from modp_ti.inputs.sources import Picture
-from pipelines.companions.pace import Plan
-from pipelines.companions.realtime_pace import RecordedPace
+from pipelines.companions.pace import Plan, RecordedPace
 from pipelines.refinement import Schedule
 from pipelines.settings import MappingSettings, RefineSettings
 

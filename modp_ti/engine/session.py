@@ -45,8 +45,8 @@ from modp_ti.outputs.progress import ProgressLine, StageProgress, TimeAfterMappi
 from modp_ti.outputs.report.record import RunRecord, StepNote, mapped_psnr, retention
 from pipelines.companions.block_files import BlockError
 from pipelines.companions.pace import CompletePace
+from pipelines.pipeline import breakdown_percent
 from pipelines.settings import RefineSettings
-from pipelines.stopwatch import breakdown_percent
 
 
 def run_scene(

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
-from fields.geometry.similarity import moved_points, moved_pose
+from fields.geometry.se3 import moved_points, moved_pose
 from modp_ti.files.errors import InputError, UnreadableImageError
 from modp_ti.inputs.protocol import Before, Event, Tracker
 

@@ -7,12 +7,12 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from fields.frames.camera_revision import CameraRevision
+from fields.frames.pose_correction import CameraRevision
 from fields.frames.tracked_frame import TrackedFrame
 from modp_ti.inputs.multiview.points_and_poses import placed_anew
 from modp_ti.inputs.multiview.reprojection import Observations
 from modp_ti.inputs.rows_of_ids import RowsOfIds
-from pipelines.memory_budget import OBSERVATION
+from pipelines.safeguards import OBSERVATION
 
 # Colour of a point seen only by held-out frames. Held-out pixels must not leak into data that others train on.
 UNSEEN = (128, 128, 128)

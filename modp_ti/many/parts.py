@@ -12,7 +12,6 @@ from pathlib import Path
 
 from rich.console import Console
 
-from fields.map.covisibility import SeenPoints, covisibility
 from modp_ti.config.settings import SceneConfig
 from modp_ti.files.errors import InputError
 from modp_ti.files.run_folder import appearing, run_folder
@@ -24,6 +23,7 @@ from modp_ti.many.batch import LOGS, run_batch
 from modp_ti.many.pool import open_pool
 from modp_ti.many.scenes import Scene, for_a_task, with_store
 from modp_ti.outputs.progress import ProgressLine
+from pipelines.select.keyframes import SeenPoints, covisibility
 
 # Least number of own frames of a part. A shorter one costs more to start than to map.
 LEAST = 8

@@ -11,7 +11,7 @@ from pathlib import Path
 from platform import node
 from typing import Any, Protocol
 
-from fields.runtime.parallel import available_cores
+from fields.runtime.process import available_cores
 from modp_ti.files.errors import InputError
 from modp_ti.files.reading import available_memory
 from modp_ti.many.task import End, TaskProcess

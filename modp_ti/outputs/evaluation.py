@@ -28,7 +28,7 @@ from pipelines.companions.transients import (
 from pipelines.optimise.losses import LossValues
 from pipelines.pipeline import Pipeline
 from pipelines.render.renderer import RenderedView
-from pipelines.whole.shown_map import ShownMap
+from pipelines.whole.hierarchy import ShownMap
 
 SIGMA = 1.0  # blur that the finest band lies above [px]
 # Batch size. Each version of the map is loaded once per batch, whose frames are all held in memory.

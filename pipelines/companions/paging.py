@@ -16,7 +16,7 @@ from fields.map.keyframes import KeyframeStore, centres_of
 from fields.runtime.process import give_back_heap
 from pipelines.companions.away import CHUNK, BlocksOnDisk, planes_of_views
 from pipelines.companions.companion import Companion
-from pipelines.memory_budget import OBSERVATION, MemoryBudget
+from pipelines.safeguards import OBSERVATION, MemoryBudget
 from pipelines.settings import MappingSettings
 
 # Side of a block [scene depths]. An image is about one scene depth wide where most of it lies.

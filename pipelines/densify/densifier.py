@@ -14,10 +14,10 @@ from fields.map.keyframes import KeyframeStore
 from fields.voxels.occupancy import OccupancyVoxels
 from pipelines.densify.depth.estimate import DepthEstimator
 from pipelines.densify.growth import Seeds, dissimilarity, error_pixels, grow, pixel_seeds, tracked_seeds
-from pipelines.memory_budget import MemoryBudget
 from pipelines.optimise.map_optimiser import MapOptimiser
+from pipelines.pipeline import Stopwatch
+from pipelines.safeguards import MemoryBudget
 from pipelines.settings import MappingSettings
-from pipelines.stopwatch import Stopwatch
 
 # A pixel whose rendered opacity is below this counts as a hole.
 HOLE = 0.5

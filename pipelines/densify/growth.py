@@ -14,8 +14,8 @@ from fields.map.gaussians import NO_ANCHOR, SH_C0, GaussianField
 from fields.map.keyframe import Keyframe
 from fields.voxels.occupancy import OccupancyVoxels
 from pipelines.densify.depth.estimate import DepthEstimator, misplacement
-from pipelines.memory_budget import MemoryBudget
 from pipelines.optimise.exposure import scene_colours
+from pipelines.safeguards import MemoryBudget
 from pipelines.settings import DensifySettings
 
 # Deviation of log depth from which a depth contains no information.

@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 
 from fields.map.keyframe import Keyframe
 from fields.map.keyframes import KeyframeStore
-from pipelines.optimise.moments import Moments
-from pipelines.optimise.safeguards import Safeguards
+from pipelines.optimise.adam import Moments
 from pipelines.render.cpu.photometric_model import IDENTITY
 from pipelines.render.renderer import Renderer
+from pipelines.safeguards import Safeguards
 from pipelines.settings import ExposureSettings
 
 # Darker values are mostly noise, brighter ones may be saturated: neither says how bright the image is.

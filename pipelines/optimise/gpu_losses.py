@@ -12,9 +12,8 @@ import torch
 
 from fields.buffers.device_pairs import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, tile_count
 from fields.buffers.images import PAD, ImageBuffers
-from fields.runtime.async_readback import AsyncReadback
 from fields.runtime.backend import on_gpu, torch_device
-from fields.runtime.compiled_kernel import CompiledKernel
+from fields.runtime.compiled_kernel import AsyncReadback, CompiledKernel
 from fields.runtime.engine import ti
 from pipelines.optimise.losses import C1, C2, RADIUS, LossValues, PhotometricLoss, window_weights
 from pipelines.render.gpu.reductions import THREAD_BITS, THREADS, BlockSums, sum_over_block

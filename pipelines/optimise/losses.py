@@ -16,14 +16,13 @@ from numpy.typing import NDArray
 
 from fields.buffers.images import PAD, SCRATCH_ROWS, STRIPS, ImageBuffers
 from fields.map.gaussians import GaussianField
-from fields.runtime.compiled_kernel import CompiledKernel, CompiledLoop
+from fields.runtime.compiled_kernel import HANDED_OUT, CompiledKernel, CompiledLoop
 from fields.runtime.engine import ti
-from fields.runtime.parallel import HANDED_OUT
 
 RADIUS = 5
 C1 = 0.01**2
 C2 = 0.03**2
-# Four strips of a channel, or four rows, per chunk (see `fields.runtime.parallel`).
+# Four strips of a channel, or four rows, per chunk (see `fields.runtime.compiled_kernel`).
 SPREAD = HANDED_OUT // 4
 
 

@@ -12,15 +12,15 @@ from numpy.typing import NDArray
 from fields.map.gaussians import GaussianField
 from fields.map.keyframe import Keyframe
 from fields.map.keyframes import KeyframeStore
-from fields.runtime.async_readback import AsyncReadback
+from fields.runtime.compiled_kernel import AsyncReadback
 from pipelines.companions.companion import Companion
 from pipelines.optimise.adam import Adam, LearningRates
 from pipelines.optimise.exposure import ExposureRefinement
 from pipelines.optimise.gpu_losses import photometric_loss
 from pipelines.optimise.losses import AspectPenalty, LossValues
-from pipelines.optimise.pose_refinement import PoseRefinement
-from pipelines.optimise.safeguards import EXPLODED, Safeguards
+from pipelines.optimise.poses import PoseRefinement
 from pipelines.render.renderer import Renderer
+from pipelines.safeguards import EXPLODED, Safeguards
 from pipelines.settings import MappingSettings
 
 

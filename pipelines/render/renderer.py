@@ -8,13 +8,12 @@ import numpy as np
 
 from fields.buffers.device_pairs import DevicePairs
 from fields.buffers.images import ImageBuffers
-from fields.buffers.projected import ProjectedGaussians
 from fields.buffers.tiles import TilePairs
-from fields.buffers.view import ViewField
+from fields.buffers.view import ProjectedGaussians, ViewField
 from fields.geometry.camera import PinholeCamera
 from fields.map.gaussians import GaussianField
-from fields.runtime.async_readback import AsyncReadback
 from fields.runtime.backend import on_gpu, refuse_too_many_fields
+from fields.runtime.compiled_kernel import AsyncReadback
 from fields.runtime.engine import ti
 from fields.runtime.tenancy import in_engine, settled
 from pipelines.render.cpu.binning import CHUNKS, Binning

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.frames.tracked_frame import TrackedFrame
-from fields.geometry.camera import PinholeCamera
-from fields.geometry.pixel_metric import pixel_metric
+from fields.geometry.camera import PinholeCamera, pixel_metric
 from fields.geometry.se3 import inverse_se3, log_se3
 from fields.map.keyframe import Keyframe
 from fields.map.trajectory import Trajectory

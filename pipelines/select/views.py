@@ -7,8 +7,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from fields.map.covisibility import SeenPoints, covisibility
 from fields.map.keyframes import KeyframeStore
+from pipelines.select.keyframes import SeenPoints, covisibility
 from pipelines.settings import ViewSettings
 
 

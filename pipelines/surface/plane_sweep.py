@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.runtime.backend import on_gpu
+from fields.runtime.compiled_kernel import HANDED_OUT
 from fields.runtime.engine import ti
-from fields.runtime.parallel import HANDED_OUT
 
 # Most sweep steps, both directions and the middle one.
 MAX_STEPS = 33
@@ -24,7 +24,7 @@ START_WEIGHT = 0.002
 LEAST_SIDE = 4.0
 # Grey value outside of an image.
 OUTSIDE = -99.0
-# Eight rows per chunk, see `fields.runtime.parallel`.
+# Eight rows per chunk, see `fields.runtime.compiled_kernel`.
 SPREAD = HANDED_OUT // 8
 # Number of pixels of a row whose results the inner loops keep in local arrays. LLVM vectorises a loop that writes to a
 # local array, as nothing that it reads can change meanwhile; and one that copies such an array to a field, if the

@@ -1,6 +1,9 @@
-"""Merging of the maps of a recording's parts: one gauge of colour, an owner of each place, one map."""
+"""Merging of the maps of a recording's parts: one gauge of colour, an owner of each place, one map.
 
-from __future__ import annotations
+What floats in free space is left out. Only its own keyframes hold the map of a part: next to what they see, large
+Gaussians with a wrong depth remain. In the keyframes of another part, they hang before the surface like fog.
+"""
+# pyright: reportArgumentType=false, reportCallIssue=false, reportInvalidTypeForm=false, reportOptionalSubscript=false
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -10,11 +13,104 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.frames.tracked_frame import TrackedFrame
+from fields.geometry.camera import PinholeCamera
 from fields.map.gaussians import SH_C0
+from fields.runtime.engine import ti
 from pipelines.online import OnlineMapper
 from pipelines.render.cpu.photometric_model import IDENTITY
+from pipelines.render.renderer import Renderer
 from pipelines.whole.finished_map import FinishedMap, take_in_frames, take_in_gaussians
-from pipelines.whole.free_space import FreeSpace, ShownSurface
+
+# A Gaussian is before a surface if its depth is less than this share of the surface's.
+BEFORE = 0.85
+# Least opacity of a pixel with a surface.
+LEAST_OPACITY = 0.5
+
+
+@dataclass(frozen=True)
+class ShownSurface:
+    """The surface that a map shows in one of its own keyframes.
+
+    Attributes:
+        number: Number of the map.
+        camera: The keyframe's camera.
+        T_camera_world: (4, 4) pose.
+        depth: (H, W) z of the surface, 0 where there is none.
+    """
+
+    number: int
+    camera: PinholeCamera
+    T_camera_world: NDArray[np.float64]
+    depth: NDArray[np.floating]
+
+
+@ti.data_oriented
+class FreeSpace:
+    """Finds the Gaussians that show more before the surfaces of other maps than anywhere else.
+
+    How much a Gaussian shows in a view is the sum of its compositing weights alpha T over the pixels with a surface.
+    The sum of alpha T / D, where D is the depth of the surface, then tells the mean inverse depth of the surface where
+    the Gaussian is. Both are derivatives of weighted sums of the picture's colours by the Gaussian's colour, and come
+    from one backward pass of compositing.
+
+    Args:
+        renderer: Renderer of the Gaussians.
+        near: Depth below which nothing is drawn [scene units].
+    """
+
+    def __init__(self, renderer: Renderer, near: float) -> None:
+        self.renderer = renderer
+        self.projected = renderer.projected
+        self._near = near
+
+    def surface(self, number: int, camera: PinholeCamera, T_camera_world: NDArray[np.float64]) -> ShownSurface:
+        """Return what the map with this number shows in a keyframe, which must be the last rendered view."""
+        depth = self.renderer.rendered().expected_depth(LEAST_OPACITY)
+        return ShownSurface(number, camera, T_camera_world, depth.astype(np.float32))
+
+    def floating(self, numbers: NDArray[np.integer], views: Sequence[ShownSurface]) -> NDArray[np.bool_]:
+        """Return which of the loaded Gaussians (N,) float before the surfaces of other maps.
+
+        Args:
+            numbers: Number (N,) of the map that each Gaussian is from.
+            views: The surfaces of all maps.
+        """
+        before, elsewhere = np.zeros(len(numbers)), np.zeros(len(numbers))
+        for view in views:
+            index, weight, weighted_ratio = self._shown(view)
+            is_before = (weighted_ratio < BEFORE * weight) & (numbers[index] != view.number)
+            before[index] += np.where(is_before, weight, 0.0)
+            elsewhere[index] += np.where(is_before, 0.0, weight)
+        return before > elsewhere
+
+    def _shown(self, view: ShownSurface) -> tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.float32]]:
+        """Return the indices (M,) of the Gaussians in a view, and the sums (M,) of alpha T and of alpha T z / D."""
+        renderer, has_surface = self.renderer, view.depth > 0
+        renderer.forward(view.camera, view.T_camera_world, self._near)
+        inverse = np.where(has_surface, 1.0 / np.where(has_surface, view.depth, 1.0), 0.0)
+        none = np.zeros_like(inverse)
+        renderer.images.set_gradients(np.stack([has_surface, inverse, none], axis=-1), none, none)
+        renderer.compositing.backward()
+        renderer.view_renders += 1
+        count = self.projected.seen[None]
+        index = np.empty(count, dtype=np.int32)
+        weight, weighted_ratio = np.empty(count, dtype=np.float32), np.empty(count, dtype=np.float32)
+        if count:
+            self._read(index, weight, weighted_ratio)
+        return index, weight, weighted_ratio
+
+    @ti.kernel
+    def _read(
+        self,
+        index: ti.types.ndarray(dtype=ti.i32, ndim=1),
+        weight: ti.types.ndarray(dtype=ti.f32, ndim=1),
+        weighted_ratio: ti.types.ndarray(dtype=ti.f32, ndim=1),
+    ):
+        for s in range(index.shape[0]):
+            index[s] = self.projected.gaussian[s]
+            weight[s] = ti.cast(self.projected.colour.grad[s][0], ti.f32)
+            weighted_ratio[s] = ti.cast(self.projected.depth[s] * self.projected.colour.grad[s][1], ti.f32)
+
 
 Exposures = Mapping[int, NDArray[np.float64]]
 
@@ -153,7 +249,7 @@ def merge(mapper: OnlineMapper, parts: Sequence[MappedPart], frames: Iterable[Tr
 
     Every frame has the pose and the exposure that the part has found that it belongs to, and every Gaussian comes from
     the part that owns its place, see `pipelines.whole.merge`. What floats where another part sees free space is
-    left out, see `pipelines.whole.free_space`.
+    left out, see `pipelines.whole.merge`.
 
     Args:
         mapper: The new map, without frames.

@@ -18,8 +18,8 @@ from fields.runtime.engine import engine, ti
 from modp_ti.outputs.formats.splats_ply import read_splats, write_splats
 from pipelines.online import OnlineMapper
 from pipelines.optimise.map_optimiser import MapOptimiser
-from pipelines.optimise.safeguards import Safeguards
 from pipelines.render.renderer import Renderer
+from pipelines.safeguards import Safeguards
 from pipelines.settings import MappingSettings
 from tests.pipelines.wall import frame
 

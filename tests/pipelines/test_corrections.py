@@ -7,18 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fields.frames.camera_revision import CameraRevision
-from fields.frames.pose_correction import PoseCorrection
-from fields.geometry.se3 import exp_se3, inverse_se3
-from fields.geometry.similarity import motion_around, moved_points, moved_pose, scale_of
+from fields.frames.pose_correction import CameraRevision, PoseCorrection
+from fields.geometry.se3 import exp_se3, inverse_se3, motion_around, moved_points, moved_pose, scale_of
 from fields.map.keyframes import KeyframeStore
 from fields.runtime.backend import initialise
 from pipelines.corrections import WorldMotion, motion_in_pixels, revise
 from pipelines.offline import OfflineMapper
-from pipelines.offline_settings import OfflineSettings
 from pipelines.online import OnlineMapper
 from pipelines.render.cpu.projection import ALPHA_MIN
-from pipelines.settings import MappingSettings
+from pipelines.settings import MappingSettings, OfflineSettings
 from tests.pipelines.wall import CAMERA, NORMAL, OFFSET, frame, pose
 
 pytestmark = pytest.mark.slow

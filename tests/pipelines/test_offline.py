@@ -10,7 +10,7 @@ import pytest
 
 from fields.map.keyframes import KeyframeStore
 from pipelines.offline import OfflineMapper, Schedule, scene_extent
-from pipelines.offline_settings import OfflineSettings
+from pipelines.settings import OfflineSettings
 from tests.patience import PATIENCE
 from tests.pipelines.test_determinism import PROJECT
 from tests.pipelines.test_online import CAMERA, frame

@@ -8,8 +8,8 @@ from fields.runtime.backend import initialise
 from modp_ti.engine.mapper import Mapper
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.delivered_frames import DeliveredFrames
-from pipelines.offline_settings import OfflineSettings
 from pipelines.pipeline import NothingToMapError
+from pipelines.settings import OfflineSettings
 from pipelines.state import MapState
 from tests.pipelines.wall import frame
 

@@ -5,8 +5,7 @@ from pydantic import BaseModel, ValidationError
 
 from fields.runtime.engine import engine
 from pipelines import settings
-from pipelines.offline_settings import OfflineSettings
-from pipelines.settings import DensifySettings, MappingSettings, RefineSettings, StrictModel
+from pipelines.settings import DensifySettings, MappingSettings, OfflineSettings, RefineSettings, StrictModel
 
 SECTIONS = [
     model for model in vars(settings).values() if isinstance(model, type) and issubclass(model, settings.StrictModel)

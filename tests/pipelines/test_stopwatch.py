@@ -2,13 +2,13 @@ from __future__ import annotations
 
 import pytest
 
-from pipelines import stopwatch
-from pipelines.stopwatch import Stopwatch, breakdown_percent
+from pipelines import pipeline
+from pipelines.pipeline import Stopwatch, breakdown_percent
 
 
 def test_times_of_a_stage_add_up_also_of_one_that_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     now = iter([0.0, 3.0, 10.0, 14.0, 20.0, 21.0])
-    monkeypatch.setattr(stopwatch.time, "perf_counter", lambda: next(now))
+    monkeypatch.setattr(pipeline.time, "perf_counter", lambda: next(now))
     watch = Stopwatch()
     with watch.measure("render"):
         pass

@@ -14,7 +14,7 @@ from modp_ti.config.scene_file import dump_scene, scene_from_data
 from modp_ti.config.settings import SceneConfig
 from modp_ti.many.pool import Ended, LocalPool, Resources
 from modp_ti.many.task import End
-from pipelines.stopwatch import breakdown_percent
+from pipelines.pipeline import breakdown_percent
 
 DEMO = Path(__file__).resolve().parents[2] / "demo" / "room.mp4"
 SCENE = f"""

@@ -8,8 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fields.geometry.se3 import inverse_se3
-from fields.geometry.similarity import moved_points, moved_pose, scale_of
+from fields.geometry.se3 import inverse_se3, moved_points, moved_pose, scale_of
 from modp_ti.inputs.klt.camera import Lens
 from modp_ti.inputs.multiview.bundle_adjustment import Refinable, adjusted_apart, adjusted_bundle
 from modp_ti.inputs.multiview.features import Features

@@ -9,8 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fields.geometry.se3 import inverse_se3
-from fields.geometry.similarity import motion_around, scale_of
+from fields.geometry.se3 import inverse_se3, motion_around, scale_of
 from modp_ti.inputs.klt.landmark_map import LANDMARKS, LandmarkMap
 from modp_ti.inputs.klt.map_connection import connected
 from modp_ti.inputs.klt.recognition import PlaceIndex, Recognition, agreeing, recognised

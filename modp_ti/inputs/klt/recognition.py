@@ -9,8 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fields.geometry.se3 import inverse_se3
-from fields.geometry.similarity import motion_around, moved_pose, scale_of
+from fields.geometry.se3 import inverse_se3, motion_around, moved_pose, scale_of
 from modp_ti.inputs.klt.frame import describe
 from modp_ti.inputs.klt.landmark_map import Keyframe, LandmarkMap
 from modp_ti.inputs.multiview.appearance import nearest_words, vlad

@@ -9,8 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fields.geometry.se3 import inverse_se3, orthonormalised
-from fields.geometry.similarity import moved_pose, scale_of
+from fields.geometry.se3 import inverse_se3, moved_pose, orthonormalised, scale_of
 from modp_ti.inputs.klt.camera import CameraRefinement, is_plausible
 from modp_ti.inputs.klt.frame import Frame, LocalisedFrame
 from modp_ti.inputs.klt.landmark_map import Keyframe, LandmarkMap

@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from fields.frames.camera_revision import CameraRevision
+from fields.frames.pose_correction import CameraRevision
 from fields.geometry.camera import PinholeCamera
 from modp_ti.inputs.sources.distortion import NO_DISTORTION, Distortion
 

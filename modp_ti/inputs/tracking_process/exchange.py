@@ -12,8 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from fields.frames.pyramid import ImageLevel
-from fields.frames.tracked_frame import TrackedFrame
+from fields.frames.tracked_frame import ImageLevel, TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from modp_ti.config.settings import SceneConfig
 from modp_ti.files.errors import InputError, UnreadableImageError

@@ -20,8 +20,7 @@ from modp_ti.files.errors import InputError
 from modp_ti.outputs.formats.gltf import write_mesh_glb
 from modp_ti.outputs.formats.points_ply import open3d
 from modp_ti.outputs.formats.textured_mesh import TexturedMesh
-from pipelines.surface.distance_field import integrate
-from pipelines.surface.support import supporting_views
+from pipelines.surface.fusion import integrate, supporting_views
 
 if TYPE_CHECKING:
     from open3d.pybind.geometry import TriangleMesh

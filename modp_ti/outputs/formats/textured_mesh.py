@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from fields.geometry.camera import PinholeCamera
 from modp_ti.files.errors import InputError
 from modp_ti.outputs.formats.points_ply import open3d
-from pipelines.surface.painting import Paint
+from pipelines.surface.fusion import Paint
 
 if TYPE_CHECKING:
     from open3d.pybind.geometry import TriangleMesh

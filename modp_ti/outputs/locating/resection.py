@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fields.geometry.camera import PinholeCamera
-from fields.geometry.pixel_metric import pixel_jacobian
+from fields.geometry.camera import PinholeCamera, pixel_jacobian
 from modp_ti.inputs.multiview.reprojection import estimated
 
 CONFIDENCE = 0.9999

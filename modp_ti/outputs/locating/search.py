@@ -16,7 +16,7 @@ from modp_ti.inputs.multiview.features import Features, detect_features, match_a
 from modp_ti.outputs.formats.mesh import without_edges
 from modp_ti.outputs.locating.resection import Resection, pose_covariance, reprojection_errors, resect
 from modp_ti.outputs.playback.map_renderer import MapRenderer, eight_bits
-from pipelines.optimise.view_alignment import ViewAlignment
+from pipelines.optimise.poses import ViewAlignment
 from pipelines.render.renderer import RenderedView
 
 # Standard deviations [px] of the blurs between which structures count: coarser than the detail that a map lacks, finer

@@ -8,10 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fields.geometry.camera import PinholeCamera
-from fields.geometry.pixel_metric import pixel_metric
-from fields.geometry.se3 import exp_se3, inverse_se3, log_se3
-from fields.geometry.similarity import motion_around, moved_pose, scale_of
+from fields.geometry.camera import PinholeCamera, pixel_metric
+from fields.geometry.se3 import exp_se3, inverse_se3, log_se3, motion_around, moved_pose, scale_of
 
 # Fewest tracked points with a depth in the map that give a frame its scale.
 LEAST_POINTS = 10

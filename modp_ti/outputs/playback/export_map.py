@@ -41,8 +41,7 @@ from modp_ti.outputs.playback.plain_colours import with_plain_colours
 from modp_ti.outputs.progress import ProgressLine
 from modp_ti.outputs.report.page import show_link_to_map
 from modp_ti.outputs.splat_page.page import level, moved, viewer_settings, write_splat_page, write_streaming_page
-from pipelines.surface.joined_depth import joined_depth
-from pipelines.surface.matched_depth import DepthMatcher, DepthView
+from pipelines.surface.depth import DepthMatcher, DepthView, joined_depth
 from pipelines.whole.hierarchy import Hierarchy
 
 TEXTURED_NAME, PAGE = "mesh.glb", "map.html"

@@ -14,7 +14,7 @@ from fields.runtime.engine import engine
 from fields.runtime.tenancy import ensure_started, in_engine, settled
 from modp_ti.files.errors import InputError
 from pipelines.render.renderer import RenderedView, Renderer
-from pipelines.whole.shown_map import ShownMap
+from pipelines.whole.hierarchy import ShownMap
 
 # Largest side of a picture [px]. The buffers of larger ones approach the gigabyte beyond which Taichi is not safe.
 MAX_SIDE = 2048

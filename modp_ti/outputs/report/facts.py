@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from fields.runtime.engine import engine
-from fields.runtime.parallel import available_cores
+from fields.runtime.process import available_cores
 from modp_ti.config.keys import as_yaml, documented_values
 from modp_ti.config.settings import SceneConfig
 from modp_ti.files.urls import without_secrets

@@ -11,8 +11,8 @@ from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import inverse_se3
 from fields.map.keyframe import Keyframe
 from fields.runtime.backend import on_gpu
+from fields.runtime.compiled_kernel import HANDED_OUT
 from fields.runtime.engine import ti
-from fields.runtime.parallel import HANDED_OUT
 from pipelines.densify.depth.estimate import DepthEstimate, point_depths, unknown_depth
 from pipelines.settings import EpipolarSettings
 
@@ -56,7 +56,7 @@ SIDE = 2 * RADIUS + 1
 PATCH = SIDE * SIDE
 # Minimum contrast of a patch that can be matched: standard deviation of grey in [0, 1].
 MIN_CONTRAST = 0.012
-# Eight pixels per chunk, see `fields.runtime.parallel`.
+# Eight pixels per chunk, see `fields.runtime.compiled_kernel`.
 SPREAD = HANDED_OUT // 8
 # Score of a patch that leaves the image.
 OUTSIDE = -2.0

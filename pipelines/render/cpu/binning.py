@@ -7,16 +7,14 @@ slots in them are processed in depth order, and independent of the number of thr
 
 import numpy as np
 
-from fields.buffers.projected import ProjectedGaussians
 from fields.buffers.tiles import TILE_HEIGHT, TILE_WIDTH, TilePairs
-from fields.buffers.view import ViewField
-from fields.runtime.compiled_kernel import CompiledKernel, CompiledLoop
+from fields.buffers.view import ProjectedGaussians, ViewField
+from fields.runtime.compiled_kernel import HANDED_OUT, CompiledKernel, CompiledLoop
 from fields.runtime.engine import ti
-from fields.runtime.parallel import HANDED_OUT
 from pipelines.render.cpu.projection import ALPHA_MIN
 
 CHUNKS = 16
-# One of these chunks per scheduling chunk, see `fields.runtime.parallel`.
+# One of these chunks per scheduling chunk, see `fields.runtime.compiled_kernel`.
 SPREAD = HANDED_OUT
 # Margin around an ellipse [px], far above rounding errors and far below a pixel.
 SLACK = 0.01

@@ -11,13 +11,10 @@ are visited.
 # pyright: reportArgumentType=false, reportInvalidTypeForm=false, reportOptionalSubscript=false
 
 from fields.buffers.images import PAD, ImageBuffers
-from fields.buffers.projected import ProjectedGaussians
 from fields.buffers.tiles import GROUP, TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, TilePairs
-from fields.buffers.view import ViewField
-from fields.runtime.compiled_kernel import CompiledKernel, CompiledLoop
+from fields.buffers.view import ProjectedGaussians, ViewField
+from fields.runtime.compiled_kernel import HANDED_OUT, CompiledKernel, CompiledLoop
 from fields.runtime.engine import ti
-from fields.runtime.parallel import HANDED_OUT
-from pipelines.render.cpu.fast_exp2 import LOG2E, fast_exp2
 from pipelines.render.cpu.projection import ALPHA_MIN
 
 ALPHA_MAX = 0.99
@@ -26,7 +23,7 @@ OPAQUE = 1e-5
 # Lower bound of the transmittance: far below what is visible, and above denormal numbers, which are slow.
 LEAST_TRANSMITTANCE = 1e-20
 ROW_BITS = TILE_WIDTH.bit_length() - 1
-# Eight tiles per chunk, see `fields.runtime.parallel`.
+# Eight tiles per chunk, see `fields.runtime.compiled_kernel`.
 SPREAD = HANDED_OUT // 8
 
 
@@ -278,3 +275,26 @@ class Compositing:
                 [conic[0] * total[5] + conic[1] * total[6], conic[1] * total[5] + conic[2] * total[6]]
             )
             self.projected.conic.grad[s] = ti.Vector([-0.5 * total[7], -total[8], -0.5 * total[9]])
+
+
+LOG2E = 1.4426950408889634
+
+
+@ti.func
+def fast_exp2(x, real: ti.template()):
+    """2^x for x <= 0. In float32 with a relative error below 4e-7, and about 2e-38 below -125; in float64 by pow.
+
+    The result is 2^n, by its exponent bits, times a minimax polynomial of 2^f, where n is the truncation of x and f is
+    in (-1, 0]. Truncation converts to an integer and back, since Taichi's fast-math would cancel the trick of rounding
+    by adding a large number. `select` replaces `max`, which would handle NaN.
+    """
+    result = ti.cast(0.0, real)
+    if ti.static(real == ti.f32):
+        t = ti.select(x > -125.0, x, -125.0)
+        n = ti.cast(t, ti.i32)
+        f = t - ti.cast(n, ti.f32)
+        p = 0.99999994 + f * (0.69314224 + f * (0.2401722 + f * (0.055279724 + f * (0.009188612 + f * 0.00093878835))))
+        result = ti.bit_cast(ti.bit_cast(p, ti.i32) + (n << 23), ti.f32)
+    else:
+        result = ti.pow(ti.cast(2.0, real), x)
+    return result

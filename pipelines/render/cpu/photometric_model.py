@@ -11,15 +11,13 @@ import numpy as np
 import torch
 
 from fields.buffers.images import PAD, ImageBuffers
-from fields.runtime.async_readback import AsyncReadback
 from fields.runtime.backend import refuse_too_many_fields
-from fields.runtime.compiled_kernel import CompiledKernel
+from fields.runtime.compiled_kernel import HANDED_OUT, AsyncReadback, CompiledKernel
 from fields.runtime.engine import ti
-from fields.runtime.parallel import HANDED_OUT
 
 IDENTITY = np.eye(3, 4)
 IDENTITY.flags.writeable = False
-# Eight rows per chunk, see `fields.runtime.parallel`.
+# Eight rows per chunk, see `fields.runtime.compiled_kernel`.
 SPREAD = HANDED_OUT // 8
 
 

@@ -12,14 +12,11 @@ have the same Gaussian, and adds to its gradients without atomics, with which th
 import numpy as np
 import torch
 
-from fields.buffers.projected import ProjectedGaussians
-from fields.buffers.view import ViewField
+from fields.buffers.view import ProjectedGaussians, ViewField
 from fields.geometry.vec3 import cross, dot, rotate, rotate_back, rotation_from_quaternion
 from fields.map.gaussians import SH_C0, GaussianField
-from fields.runtime.async_readback import AsyncReadback
-from fields.runtime.compiled_kernel import CompiledLoop
+from fields.runtime.compiled_kernel import HANDED_OUT, AsyncReadback, CompiledLoop
 from fields.runtime.engine import ti
-from fields.runtime.parallel import HANDED_OUT
 from pipelines.render.spherical_harmonics import add_sh_gradient, evaluate_sh
 
 # Variance of the pixel's footprint, added to every ellipse [px^2].
@@ -35,7 +32,7 @@ MIN_DETERMINANT_RATIO = 1e-6
 # Time of a Gaussian on one thread, for harmonics of degree 0 to 3 [ns].
 PROJECT, PROJECT_BACK, BEGIN_BACK = (43, 48, 57, 67), (100, 107, 121, 136), (7, 12, 20, 33)
 CHUNK = 512
-# Two of these chunks per scheduling chunk, see `fields.runtime.parallel`.
+# Two of these chunks per scheduling chunk, see `fields.runtime.compiled_kernel`.
 SPREAD = HANDED_OUT // 2
 
 

@@ -6,11 +6,9 @@ from collections import deque
 import torch
 
 from fields.buffers.device_pairs import NO_TILE, TILE_HEIGHT, TILE_WIDTH, DevicePairs
-from fields.buffers.projected import ProjectedGaussians
-from fields.buffers.view import ViewField
-from fields.runtime.async_readback import AsyncReadback
+from fields.buffers.view import ProjectedGaussians, ViewField
 from fields.runtime.backend import torch_device
-from fields.runtime.compiled_kernel import CompiledKernel
+from fields.runtime.compiled_kernel import AsyncReadback, CompiledKernel
 from fields.runtime.engine import ti
 from pipelines.render.cpu.binning import Binning
 

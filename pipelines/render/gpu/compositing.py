@@ -10,8 +10,7 @@ import torch
 
 from fields.buffers.device_pairs import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, DevicePairs
 from fields.buffers.images import PAD, ImageBuffers
-from fields.buffers.projected import ProjectedGaussians
-from fields.buffers.view import ViewField
+from fields.buffers.view import ProjectedGaussians, ViewField
 from fields.runtime.compiled_kernel import CompiledKernel
 from fields.runtime.engine import ti
 from pipelines.render.cpu.compositing import ALPHA_MAX, OPAQUE

@@ -5,9 +5,8 @@ import numpy as np
 import torch
 
 from fields.buffers.images import PAD, ImageBuffers
-from fields.runtime.async_readback import AsyncReadback
 from fields.runtime.backend import torch_device, without_waiting
-from fields.runtime.compiled_kernel import CompiledKernel
+from fields.runtime.compiled_kernel import AsyncReadback, CompiledKernel
 from fields.runtime.engine import ti
 from pipelines.render.cpu.photometric_model import PhotometricModel
 from pipelines.render.gpu.reductions import THREAD_BITS, THREADS, BlockSums, sum_over_block

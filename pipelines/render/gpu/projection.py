@@ -4,12 +4,10 @@
 import numpy as np
 import torch
 
-from fields.buffers.projected import ProjectedGaussians
-from fields.buffers.view import ViewField
+from fields.buffers.view import ProjectedGaussians, ViewField
 from fields.map.gaussians import GaussianField
-from fields.runtime.async_readback import AsyncReadback
 from fields.runtime.backend import torch_device
-from fields.runtime.compiled_kernel import CompiledKernel
+from fields.runtime.compiled_kernel import AsyncReadback, CompiledKernel
 from fields.runtime.engine import ti
 from pipelines.render.cpu.projection import Projection
 from pipelines.render.gpu.reductions import THREAD_BITS, THREADS, sum_over_block

@@ -4,7 +4,7 @@ import gc
 
 import numpy as np
 
-from fields.buffers.device_images import DeviceImages
+from fields.buffers.images import DeviceImages
 
 
 def image(seed: int) -> np.ndarray:

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from fields.frames.pose_correction import PoseCorrection
-from fields.frames.pyramid import MIN_SIDE, build_pyramid
-from fields.frames.tracked_frame import SparsePoints, TrackedFrame
+from fields.frames.tracked_frame import MIN_SIDE, SparsePoints, TrackedFrame, build_pyramid
 from fields.geometry.camera import PinholeCamera
 from fields.map.keyframes import KeyframeStore
 

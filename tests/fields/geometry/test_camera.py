@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from fields.geometry.camera import PinholeCamera
-from fields.geometry.pixel_metric import pixel_metric
+from fields.geometry.camera import PinholeCamera, pixel_metric
 from fields.geometry.se3 import exp_se3
 from fields.geometry.vec3 import cross, dot, rotate, rotate_back
 from fields.runtime.engine import ti

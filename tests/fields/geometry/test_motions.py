@@ -18,12 +18,15 @@ from fields.geometry.se3 import (
     inverse_se3,
     log_se3,
     matrix_from_quaternion,
+    motion_around,
+    moved_points,
+    moved_pose,
     orthonormalised,
     quaternion_from_matrix,
     quaternions_from_matrices,
+    scale_of,
     torch_exp_se3,
 )
-from fields.geometry.similarity import motion_around, moved_points, moved_pose, scale_of
 
 
 def tangents() -> list[NDArray[np.float64]]:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from fields.runtime.engine import TAICHI, engine
-from fields.runtime.vulkan_devices import vulkan_devices
+from fields.runtime.gpus import vulkan_devices
 from tests.patience import PATIENCE
 
 pytestmark = pytest.mark.slow

@@ -15,10 +15,10 @@ import pytest
 import torch
 
 from fields.runtime import process
-from fields.runtime.async_readback import AsyncReadback
+from fields.runtime.compiled_kernel import AsyncReadback
 from fields.runtime.engine import engine
+from fields.runtime.gpus import VulkanDevice, choose, vulkan_devices
 from fields.runtime.process import NEEDED, why_too_narrow
-from fields.runtime.vulkan_devices import VulkanDevice, choose, vulkan_devices
 from tests.patience import PATIENCE
 
 # 400 arrays of 100 kB, too small for pages of their own, below one that stays.

@@ -17,8 +17,7 @@ import pytest
 from numpy.typing import NDArray
 
 from fields.frames.origin import shifted_poses
-from fields.geometry.se3 import exp_se3, inverse_se3
-from fields.geometry.similarity import moved_points, moved_pose
+from fields.geometry.se3 import exp_se3, inverse_se3, moved_points, moved_pose
 from modp_ti.engine.snapshots import FILE
 from modp_ti.outputs.formats.run_files import read_masks, read_scores
 from modp_ti.outputs.formats.splats_ply import read_splats

@@ -31,7 +31,7 @@ from modp_ti.outputs.formats.run_files import read_scores
 from modp_ti.outputs.formats.splats_ply import read_splats
 from modp_ti.outputs.formats.trajectory import read_trajectory
 from modp_ti.outputs.lpips import open_lpips
-from pipelines.stopwatch import Stopwatch
+from pipelines.pipeline import Stopwatch
 from tests.modp_ti.outputs.report.made_up_run import Page
 from tests.modp_ti.runs import FILES, SHORT_RUN, run
 

@@ -7,8 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 import pytest
 
-from fields.frames.camera_revision import CameraRevision
-from fields.frames.pose_correction import PoseCorrection
+from fields.frames.pose_correction import CameraRevision, PoseCorrection
 from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import exp_se3

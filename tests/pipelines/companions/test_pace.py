@@ -7,8 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from pipelines.companions.pace import CompletePace, Plan
-from pipelines.companions.realtime_pace import RealtimePace, RecordedPace
+from pipelines.companions.pace import CompletePace, Plan, RealtimePace, RecordedPace
 from pipelines.settings import CorrectionSettings, MappingSettings, OptimiseSettings
 
 

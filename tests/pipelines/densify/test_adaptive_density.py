@@ -10,8 +10,8 @@ from fields.geometry.se3 import exp_se3, matrix_from_quaternion
 from fields.map.gaussians import GaussianField
 from fields.runtime.engine import ti
 from pipelines.densify.adaptive_density import AdaptiveDensity, GradientStatistics
-from pipelines.offline_settings import OfflineSettings
 from pipelines.render.renderer import Renderer
+from pipelines.settings import OfflineSettings
 from tests.pipelines.scenes import CAMERA, NEAR, POSE, random_gaussians
 
 pytestmark = pytest.mark.slow

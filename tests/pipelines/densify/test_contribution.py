@@ -10,7 +10,7 @@ from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import exp_se3
 from fields.map.gaussians import GaussianField
 from fields.map.keyframes import KeyframeStore
-from pipelines.densify.contribution import Contribution
+from pipelines.companions.hidden_gaussians import Contribution
 from pipelines.render.renderer import Renderer
 from tests.pipelines import reference
 from tests.pipelines.scenes import CAMERA, NEAR, POSE, random_gaussians

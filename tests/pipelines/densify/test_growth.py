@@ -15,11 +15,10 @@ from fields.map.gaussians import SH_C0, GaussianField
 from fields.map.keyframe import Keyframe
 from fields.map.keyframes import KeyframeStore
 from fields.voxels.occupancy import OccupancyVoxels
+from pipelines.densify.adaptive_density import PointCloud, initialise, spacing, union_of_points
 from pipelines.densify.depth.estimate import DepthEstimate, misplacement
 from pipelines.densify.growth import Seeds, dissimilarity, error_pixels, grow, pixel_seeds, tracked_seeds
-from pipelines.densify.point_initialisation import PointCloud, initialise, spacing, union_of_points
-from pipelines.memory_budget import MemoryBudget
-from pipelines.optimise.safeguards import Safeguards
+from pipelines.safeguards import MemoryBudget, Safeguards
 from pipelines.settings import DensifySettings
 
 CAMERA = PinholeCamera(100.0, 100.0, 80.0, 60.0, 160, 120)

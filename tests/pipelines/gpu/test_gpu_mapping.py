@@ -12,9 +12,8 @@ from fields.frames.tracked_frame import SparsePoints
 from fields.map.keyframes import KeyframeStore
 from fields.runtime.backend import initialise
 from pipelines.offline import OfflineMapper
-from pipelines.offline_settings import OfflineSettings
 from pipelines.online import OnlineMapper
-from pipelines.settings import MappingSettings
+from pipelines.settings import MappingSettings, OfflineSettings
 from pipelines.state import MapState, restore_state, save_state
 from tests.pipelines.wall import frame
 

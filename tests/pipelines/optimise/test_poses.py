@@ -9,16 +9,14 @@ import pytest
 from numpy.typing import NDArray
 
 from fields.frames.tracked_frame import SparsePoints, TrackedFrame
-from fields.geometry.camera import PinholeCamera
-from fields.geometry.pixel_metric import pixel_metric
+from fields.geometry.camera import PinholeCamera, pixel_metric
 from fields.geometry.se3 import exp_se3, inverse_se3, log_se3
 from fields.map.gaussians import SH_C0, GaussianField
 from fields.map.keyframe import Keyframe
 from fields.map.keyframes import KeyframeStore
 from fields.runtime.engine import ti
 from pipelines.optimise.losses import PhotometricLoss
-from pipelines.optimise.pose_refinement import PoseRefinement, reprojection
-from pipelines.optimise.view_alignment import ViewAlignment
+from pipelines.optimise.poses import PoseRefinement, ViewAlignment, reprojection
 from pipelines.render.renderer import Renderer
 from tests.pipelines.scenes import CAMERA as LENS
 from tests.pipelines.scenes import NEAR, POSE, random_gaussians

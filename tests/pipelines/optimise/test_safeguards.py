@@ -9,8 +9,8 @@ from fields.geometry.se3 import exp_se3
 from fields.map.gaussians import GaussianField
 from fields.map.keyframe import Keyframe
 from pipelines.optimise.adam import Adam
-from pipelines.optimise.pose_refinement import PoseRefinement
-from pipelines.optimise.safeguards import Safeguards
+from pipelines.optimise.poses import PoseRefinement
+from pipelines.safeguards import Safeguards
 from tests.pipelines.optimise.test_adam import RATES, N, load, set_gradients
 from tests.pipelines.optimise.test_poses import POSE, black, tracked
 

@@ -9,9 +9,16 @@ import pytest
 
 from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import exp_se3
-from pipelines.surface.agreement import Placed, agreeing_views
-from pipelines.surface.joined_depth import fitted_plane, joined_depth, planes_of_plain_regions
-from pipelines.surface.matched_depth import DepthMatcher, DepthView, choose_neighbours
+from pipelines.surface.depth import (
+    DepthMatcher,
+    DepthView,
+    Placed,
+    agreeing_views,
+    choose_neighbours,
+    fitted_plane,
+    joined_depth,
+    planes_of_plain_regions,
+)
 
 TOLERANCE = 0.02
 UNEVEN = PinholeCamera(60.0, 62.0, 34.0, 25.0, 70, 50)  # the width is no multiple of what the kernel works on at once

@@ -14,8 +14,7 @@ from fields.map.gaussians import GaussianField
 from fields.runtime.backend import initialise
 from pipelines.companions.paging import grouped
 from pipelines.render.renderer import Renderer
-from pipelines.whole.hierarchy import LEVELS, MOST_OPAQUE, Hierarchy, merged
-from pipelines.whole.shown_map import ShownMap
+from pipelines.whole.hierarchy import LEVELS, MOST_OPAQUE, Hierarchy, ShownMap, merged
 from tests.pipelines.wall import CAMERA
 
 

@@ -11,8 +11,18 @@ from numpy.typing import NDArray
 from fields.geometry.se3 import exp_se3, inverse_se3
 from fields.map.gaussians import SH_C0
 from pipelines.render.renderer import Renderer
-from pipelines.whole.free_space import BEFORE, FreeSpace, ShownSurface
-from pipelines.whole.merge import MappedPart, Shown, colour_changes, exposed_in, merge, owned, recoloured
+from pipelines.whole.merge import (
+    BEFORE,
+    FreeSpace,
+    MappedPart,
+    Shown,
+    ShownSurface,
+    colour_changes,
+    exposed_in,
+    merge,
+    owned,
+    recoloured,
+)
 from tests.pipelines import reference
 from tests.pipelines.mapped_wall import finished_mapper, fresh_mapper
 from tests.pipelines.scenes import CAMERA, NEAR, POSE, random_gaussians

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fields.geometry.se3 import exp_se3, inverse_se3
-from fields.geometry.similarity import moved_pose, scale_of
+from fields.geometry.se3 import exp_se3, inverse_se3, moved_pose, scale_of
 from modp_ti.inputs.klt.camera import Lens
 from modp_ti.inputs.klt.loop_closing import Link, LoopClosing, closed_loop
 from modp_ti.inputs.klt.odometry import Odometry

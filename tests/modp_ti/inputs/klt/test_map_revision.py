@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fields.geometry.se3 import exp_se3
-from fields.geometry.similarity import moved_points, moved_pose
+from fields.geometry.se3 import exp_se3, moved_points, moved_pose
 from modp_ti.inputs.klt.camera import Lens
 from modp_ti.inputs.klt.landmark_map import Keyframe, LandmarkMap
 from modp_ti.inputs.klt.loop_closing import carry_over

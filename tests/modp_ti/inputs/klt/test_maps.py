@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fields.geometry.se3 import exp_se3
-from fields.geometry.similarity import moved_points, moved_pose
+from fields.geometry.se3 import exp_se3, moved_points, moved_pose
 from modp_ti.inputs.klt.camera import Lens
 from modp_ti.inputs.klt.landmark_map import Keyframe, LandmarkMap
 from modp_ti.inputs.klt.map_connection import MapJoining

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fields.geometry.se3 import exp_se3, inverse_se3
-from fields.geometry.similarity import moved_points, moved_pose
+from fields.geometry.se3 import exp_se3, inverse_se3, moved_points, moved_pose
 from modp_ti.inputs.klt.camera import Lens
 from modp_ti.inputs.klt.frame import corners
 from modp_ti.inputs.klt.landmark_map import Keyframe, LandmarkMap

@@ -9,8 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from fields.geometry.camera import PinholeCamera
-from fields.geometry.se3 import exp_se3
-from fields.geometry.similarity import moved_points, moved_pose, scale_of
+from fields.geometry.se3 import exp_se3, moved_points, moved_pose, scale_of
 from modp_ti.outputs.locating.world_alignment import PlacedFrame, image_motion, world_alignment
 from tests.room import look_at
 

@@ -20,7 +20,7 @@ from pipelines.densify.depth.gaussian_process import (
     nonstationary_variance,
     regress_log_depth,
 )
-from pipelines.densify.depth.map_depth import MapDepth
+from pipelines.densify.depth.sources import MapDepth
 from pipelines.render.renderer import Renderer
 from pipelines.settings import DepthSettings
 from tests.pipelines.wall import frame, on_the_plane, pose

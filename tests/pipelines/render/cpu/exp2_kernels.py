@@ -3,7 +3,7 @@
 import numpy as np
 
 from fields.runtime.engine import ti
-from pipelines.render.cpu.fast_exp2 import fast_exp2
+from pipelines.render.cpu.compositing import fast_exp2
 
 
 @ti.kernel

@@ -1,12 +1,15 @@
-"""The Vulkan devices of this machine, asked through the system's Vulkan loader."""
-
-from __future__ import annotations
+"""The GPUs of this machine: its Vulkan devices, and whether the running one computes what the kernels need."""
+# pyright: reportGeneralTypeIssues=false, reportIndexIssue=false
 
 import ctypes
 import functools
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+
+import numpy as np
+
+from fields.runtime.engine import ti
 
 LIBRARY = "vulkan-1.dll" if sys.platform == "win32" else "libvulkan.so.1"
 # VkPhysicalDeviceType. Software drivers are of type 4, a CPU.
@@ -100,3 +103,34 @@ def choose(devices: Sequence[VulkanDevice], asked: str | None = None) -> VulkanD
             return device
     order = {kind: place for place, kind in enumerate(PREFERRED)}
     return min(devices, key=lambda device: order.get(device.kind, len(order)), default=None)
+
+
+BLOCK = 64
+VALUES = ti.types.ndarray(dtype=ti.i32, ndim=1)
+
+
+@ti.kernel
+def _sum_blocks(values: VALUES, sums: VALUES):
+    ti.loop_config(block_dim=BLOCK)
+    for i in range(values.shape[0]):
+        shared = ti.simt.block.SharedArray((BLOCK,), ti.i32)
+        shared[i & (BLOCK - 1)] = values[i]
+        ti.simt.block.sync()
+        total = ti.cast(0, ti.u64)
+        for k in range(BLOCK):
+            total += ti.cast(shared[k], ti.u64) << ti.cast(32, ti.u64)
+        sums[i] = ti.cast(total >> ti.cast(32, ti.u64), ti.i32)
+
+
+def computes_rightly() -> bool:
+    """Return whether the running GPU adds up blocks by shared memory and 64-bit integers, as the kernels need.
+
+    A driver without them refuses the kernel or computes something else.
+    """
+    values = np.arange(4 * BLOCK, dtype=np.int32)
+    sums = np.zeros_like(values)
+    try:
+        _sum_blocks(values, sums)
+    except Exception:  # the engines raise several kinds, and each means no
+        return False
+    return bool((sums == np.repeat(values.reshape(4, BLOCK).sum(axis=1), BLOCK)).all())
