@@ -14,10 +14,9 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from modp_ti.files import LARGEST, limited_lines, open_file, readable
+from modp_ti.files import LARGEST, limited_lines, open_file, reading
 from modp_ti.files.errors import InputError
-from modp_ti.files.limits import most_unpacked
-from modp_ti.files.reading import text_encoding
+from modp_ti.files.reading import most_unpacked, text_encoding
 
 BLOCK, BLOCK_CHARACTERS = 5_000, 1 << 20  # rows and characters of a block, whichever comes first
 
@@ -36,7 +35,7 @@ def read_csv_blocks(path: Path, columns: Mapping[str, str]) -> Iterator[tuple[in
         InputError: With file and line, if a column is missing from the header, a row has the wrong length, or a value
             is not a finite number; with the file, if it is truncated or cannot be read.
     """
-    with readable(path), open_file(path) as stored:
+    with reading(path), open_file(path) as stored:
         encoding = text_encoding(stored.peek(2))
         unpacked = _Unpacked(path, stored) if path.suffix == ".gz" else stored
         try:

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import errno
+import os
 import zipfile
-from abc import ABC, abstractmethod
+import zlib
 from copy import copy
 from pathlib import Path
 from typing import Any
 
 from modp_ti.files.errors import InputError
-from modp_ti.files.json_text import parse_json
-from modp_ti.files.limits import BoundedZip
-from modp_ti.files.reading import is_file, open_file, read_bytes, readable, text_encoding
+from modp_ti.files.reading import most_unpacked, open_file, parse_json, read_bytes, reading, text_encoding
 
 ARCHIVES = (".r3d", ".zip")
 """Suffixes of recordings in one archive."""
@@ -20,30 +18,77 @@ ARCHIVES = (".r3d", ".zip")
 SETTING = " (source.path)"
 
 
-class FileTree(ABC):
-    """Files by name. Names are relative to `path` and have forward slashes.
+class FileTree:
+    """Files by name. Names are relative to `path` and have forward slashes. Hidden files are left out.
 
-    Attributes:
-        path: The folder, or the archive.
+    Args:
+        path: A folder, or a zip archive.
+
+    Raises:
+        InputError: If it is neither.
     """
 
-    path: Path
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._zip: zipfile.ZipFile | None = None
+        self._inner = ""  # the folder of the archive that names are relative to
+        if not path.is_dir():
+            with reading(path, SETTING):
+                open_file(path).close()  # it is a regular file
+                try:
+                    self._zip = zipfile.ZipFile(path)
+                except zipfile.BadZipFile:
+                    raise InputError(f"{path}: is no zip archive, or is cut off: copy it again{SETTING}") from None
 
-    @abstractmethod
+    @property
+    def _root(self) -> Path | zipfile.Path:
+        return self.path if self._zip is None else zipfile.Path(self._zip, self._inner)
+
+    @property
+    def is_folder(self) -> bool:
+        """Whether it is a folder, whose files other libraries can open by their paths."""
+        return self._zip is None
+
+    def below(self) -> FileTree | None:
+        """Return the tree of the one folder that it holds; None if there is none, or more."""
+        tops = [each.name for each in self._root.iterdir() if each.is_dir() and not _is_of_system(each.name)]
+        if len(tops) != 1:
+            return None
+        inner = copy(self)
+        if self._zip is None:
+            inner.path = self.path / tops[0]
+        else:
+            inner._inner = f"{self._inner}{tops[0]}/"
+        return inner
+
     def has(self, name: str) -> bool:
         """Whether there is a file of this name."""
+        return os.path.isfile(self.path / name) if self._zip is None else (self._root / name).is_file()
 
-    @abstractmethod
     def listed(self, folder: str = "") -> list[str]:
         """Return the names of the files that lie directly in a folder, sorted; none if there is no such folder."""
+        place = self._root / folder if folder else self._root
+        found = place.iterdir() if place.is_dir() else ()
+        names = sorted(each.name for each in found if each.is_file() and not _is_of_system(each.name))
+        return [f"{folder}/{name}" if folder else name for name in names]
 
-    @abstractmethod
     def read(self, name: str) -> bytes:
         """Read a whole file.
 
         Raises:
             OSError: If it is missing, damaged or too large.
         """
+        if self._zip is None:
+            return read_bytes(self.path / name)
+        try:
+            info = self._zip.getinfo(self._inner + name)
+            if info.file_size > most_unpacked(info.compress_size):
+                raise OSError(0, f"it claims to unpack to {info.file_size >> 20} MiB")
+            return self._zip.read(info)
+        except KeyError:
+            raise FileNotFoundError(0, "it is not in the archive") from None
+        except (zipfile.BadZipFile, zlib.error, EOFError, ValueError, NotImplementedError, RuntimeError):
+            raise OSError(0, "it is damaged, encrypted or packed in an unknown way") from None
 
     def read_text(self, name: str) -> str:
         """Read a whole file as text. Raises OSError as `read`, and UnicodeDecodeError if it is none."""
@@ -52,91 +97,17 @@ class FileTree(ABC):
 
     def read_json(self, name: str) -> Any:
         """Read a JSON file. Raises InputError if it is missing or not valid."""
-        with readable(self.path / name, SETTING):
-            text = self.read_text(name)
-        return parse_json(text, str(self.path / name))
-
-    def close(self) -> None:  # noqa: B027 - a folder holds nothing open
-        """Close the archive."""
-
-
-class Folder(FileTree):
-    """The files of a folder."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def has(self, name: str) -> bool:
-        return is_file(self.path / name)
-
-    def listed(self, folder: str = "") -> list[str]:
-        try:
-            inside = sorted(each.name for each in (self.path / folder).iterdir())
-        except OSError:
-            return []
-        names = (f"{folder}/{name}" if folder else name for name in inside if not name.startswith("."))
-        return [name for name in names if self.has(name)]
-
-    def read(self, name: str) -> bytes:
-        return read_bytes(self.path / name)
-
-
-class Archive(FileTree):
-    """The files of a zip archive. What macOS adds to archives is left out.
-
-    Args:
-        path: The archive.
-
-    Raises:
-        InputError: If it is no zip archive.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        with readable(path, SETTING):
-            self._file = open_file(path)
-        try:
-            self._zip = BoundedZip(self._file)
-        except (zipfile.BadZipFile, OSError):
-            self._file.close()
-            raise InputError(f"{path}: is no zip archive, or is cut off: copy it again{SETTING}") from None
-        named = (info for info in self._zip.infolist() if info.filename)
-        members = {info.filename.replace("\\", "/"): info for info in named if not info.is_dir()}
-        self._members = {name: info for name, info in members.items() if not _is_of_system(name)}
-
-    def without_top(self) -> Archive:
-        """Return the archive without the folder in which all of its files lie; itself if there is no such folder."""
-        tops = {name.partition("/")[0] if "/" in name else "" for name in self._members}
-        if len(tops) != 1 or "" in tops:
-            return self
-        inner = copy(self)
-        start = len(tops.pop()) + 1
-        inner._members = {name[start:]: info for name, info in self._members.items()}
-        return inner
-
-    def has(self, name: str) -> bool:
-        return name in self._members
-
-    def listed(self, folder: str = "") -> list[str]:
-        start = f"{folder}/" if folder else ""
-        return sorted(name for name in self._members if name.startswith(start) and "/" not in name[len(start) :])
-
-    def read(self, name: str) -> bytes:
-        info = self._members.get(name)
-        if info is None:
-            raise FileNotFoundError(errno.ENOENT, "it is not in the archive")
-        try:
-            return self._zip.read(info)
-        except zipfile.BadZipFile as error:
-            raise OSError(errno.EIO, str(error)) from None
+        with reading(self.path / name, SETTING):
+            return parse_json(self.read_text(name), str(self.path / name))
 
     def close(self) -> None:
-        self._zip.close()
-        self._file.close()
+        """Close the archive."""
+        if self._zip is not None:
+            self._zip.close()
 
 
 def _is_of_system(name: str) -> bool:
-    return any(part.startswith(".") or part == "__MACOSX" for part in name.split("/"))
+    return name.startswith(".") or name == "__MACOSX"
 
 
 def open_tree(path: Path) -> list[FileTree]:
@@ -148,9 +119,6 @@ def open_tree(path: Path) -> list[FileTree]:
     Raises:
         InputError: If it is neither.
     """
-    if path.is_dir():
-        folders = [each for each in path.iterdir() if each.is_dir() and not _is_of_system(each.name)]
-        return [Folder(path), *map(Folder, folders[:1] if len(folders) == 1 else ())]
-    archive = Archive(path)
-    inner = archive.without_top()
-    return [archive] if inner is archive else [archive, inner]
+    tree = FileTree(path)
+    inner = tree.below()
+    return [tree] if inner is None else [tree, inner]

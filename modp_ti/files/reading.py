@@ -1,6 +1,6 @@
 """Bounded reading of regular files. Pipes, devices and files too large for the memory are refused.
 
-Failures raise OSError with a readable `strerror`. Readers report it through `readable`.
+Failures raise OSError with a legible `strerror`, which `reading` reports as an InputError.
 """
 
 from __future__ import annotations
@@ -8,12 +8,13 @@ from __future__ import annotations
 import codecs
 import errno
 import io
+import json
 import os
-import stat
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import psutil
 
@@ -25,6 +26,8 @@ MAX_LINE = 1 << 16
 LARGEST = 1e30
 """Largest accepted magnitude of a number. No tracker writes larger ones, and their products could overflow float64."""
 
+# Packed data may unpack to this many bytes, plus a multiple of the packed ones. Text of numbers packs to a tenth.
+SMALL = 6 << 20
 # Share of the available memory that one file may take.
 SHARE = 0.25
 CGROUP_LIMITS = (
@@ -33,19 +36,12 @@ CGROUP_LIMITS = (
 )
 
 
-def is_file(path: Path) -> bool:
-    """Whether `path` is a regular file. Invalid paths, such as names that are too long, give False."""
-    return os.path.isfile(path)
-
-
-def exists(path: Path) -> bool:
-    """Whether `path` exists. Invalid paths give False."""
-    return os.path.exists(path)
-
-
 @contextmanager
-def readable(path: str | os.PathLike[str], hint: str = "") -> Iterator[None]:
-    """Report a file that cannot be read within the block as an InputError that names it.
+def reading(path: str | os.PathLike[str], hint: str = "") -> Iterator[None]:
+    """Report whatever a reader raises within the block as an InputError of one line that names the file.
+
+    It stands where a user's file is read. The message of an unexpected exception names its place, so that a fault of
+    the reader is seen as one.
 
     Args:
         path: The file.
@@ -53,29 +49,14 @@ def readable(path: str | os.PathLike[str], hint: str = "") -> Iterator[None]:
     """
     try:
         yield
+    except (InputError, ImportError):
+        raise
     except FileNotFoundError:
         raise InputError(f"{path}: no such file{hint}") from None
     except UnicodeDecodeError:
         raise InputError(f"{path}: cannot be read as text: it holds bytes that are no text{hint}") from None
     except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}{hint}") from None
-
-
-@contextmanager
-def reading(path: str | os.PathLike[str], hint: str = "") -> Iterator[None]:
-    """Report whatever a reader raises within the block as an InputError that names the file.
-
-    It stands at the borders where a stranger's file is read, so that no damage leads to a traceback. The message names
-    the exception and its place, so that a fault of a reader is seen as one.
-
-    Args:
-        path: The file.
-        hint: End of the message.
-    """
-    try:
-        yield
-    except (InputError, ImportError):
-        raise
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}{hint}") from None
     except MemoryError:
         raise InputError(f"{path}: takes more memory than there is{hint}") from None
     except Exception as error:
@@ -90,18 +71,9 @@ def open_file(path: str | os.PathLike[str]) -> io.BufferedReader:
     Raises:
         OSError: If it cannot be opened, or is a folder, a pipe (which could block forever), a socket or a device.
     """
-    name = os.fspath(path)
-    try:
-        descriptor = os.open(name, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
-    except ValueError:
-        raise OSError(errno.EINVAL, "its name holds a NUL character") from None
-    mode = os.fstat(descriptor).st_mode
-    if not stat.S_ISREG(mode):
-        os.close(descriptor)
-        if stat.S_ISDIR(mode):
-            raise IsADirectoryError(errno.EISDIR, "it is a folder")
-        raise OSError(errno.EINVAL, "it is a pipe, a socket or a device")
-    return os.fdopen(descriptor, "rb")
+    if os.path.exists(path) and not os.path.isfile(path):
+        raise OSError(errno.EINVAL, "it is a folder, a pipe, a socket or a device")
+    return open(path, "rb")
 
 
 def read_bytes(path: str | os.PathLike[str]) -> bytes:
@@ -133,6 +105,42 @@ def read_text(path: str | os.PathLike[str]) -> str:
     return data.decode(text_encoding(data))
 
 
+def read_json(path: Path, setting: str) -> Any:
+    """Read a JSON file; see `parse_json`.
+
+    Args:
+        path: The file.
+        setting: The configuration key that names the file, for the error message.
+
+    Raises:
+        InputError: If the file cannot be read as text or is not valid JSON.
+    """
+    with reading(path, f" ({setting})"):
+        return parse_json(read_text(path), str(path))
+
+
+def parse_json(text: str, name: str, line: int = 1) -> Any:
+    """Parse a JSON text.
+
+    Numbers may be NaN or infinite, and the caller must check that they are finite.
+
+    Args:
+        text: The JSON text.
+        name: Name of the file, for the error message.
+        line: Line of the file at which the text starts, for the error message.
+
+    Raises:
+        InputError: With the line, if the text is not valid JSON or is nested deeper than Python follows.
+    """
+    try:
+        return json.loads(text, parse_int=lambda digits: (int if len(digits) <= 18 else float)(digits))
+    except (ValueError, RecursionError) as error:
+        place, reason = (error.lineno, error.msg) if isinstance(error, json.JSONDecodeError) else (1, str(error))
+        raise InputError(
+            f"{name}:{line + place - 1}: not valid JSON: {reason}; the file is cut off or damaged"
+        ) from None
+
+
 def text_lines(path: str | os.PathLike[str], longest: int = MAX_LINE) -> Iterator[str]:
     """Iterate over the lines of a text file as of `read_text`, with their line ends.
 
@@ -149,8 +157,8 @@ def text_lines(path: str | os.PathLike[str], longest: int = MAX_LINE) -> Iterato
 
 
 def input_lines(path: Path, hint: str = "", longest: int = MAX_LINE) -> Iterator[str]:
-    """Iterate over the lines of the user's file as `text_lines` does. Failures are reported as by `readable`."""
-    with readable(path, hint):
+    """Iterate over the lines of the user's file as `text_lines` does. Failures are reported as by `reading`."""
+    with reading(path, hint):
         yield from text_lines(path, longest=longest)
 
 
@@ -162,6 +170,11 @@ def limited_lines(text: io.TextIOBase, longest: int = MAX_LINE) -> Iterator[str]
         if len(line) > longest:
             raise OSError(errno.EFBIG, f"line {number} has more than {longest:,} characters")
         yield line
+
+
+def most_unpacked(packed: int, ratio: int = 25) -> int:
+    """Return the number of bytes to which so many packed ones may unpack at most."""
+    return SMALL + ratio * packed
 
 
 def available_memory() -> int:

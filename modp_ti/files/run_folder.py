@@ -17,7 +17,7 @@ from pathlib import Path, PurePosixPath
 
 from modp_ti.files.atomic import replace_text, sync_folder
 from modp_ti.files.errors import InputError
-from modp_ti.files.json_text import read_json
+from modp_ti.files.reading import read_json
 from modp_ti.files.sole_use import sole_use
 
 PRIVATE = ".modp-ti"

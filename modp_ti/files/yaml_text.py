@@ -10,8 +10,8 @@ import yaml
 
 from modp_ti.files.errors import InputError
 
-# Characters, events, nesting depth, and characters of an integer.
-MAX_TEXT, MAX_EVENTS, MAX_DEPTH, MAX_DIGITS = 1 << 18, 20_000, 16, 19
+# Characters, nodes, nesting depth, and characters of an integer.
+MAX_TEXT, MAX_NODES, MAX_DEPTH, MAX_DIGITS = 1 << 18, 20_000, 16, 19
 _INT = re.compile(r"[-+]?[0-9]+")
 _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
 
@@ -31,8 +31,7 @@ def parse_yaml(text: str, name: str, lines: dict[str, int]) -> Any:
     if len(text) > MAX_TEXT:
         raise InputError(f"{name}: has {len(text):,} characters, where at most {MAX_TEXT:,} are taken")
     try:
-        _require_flat(text, name)
-        node = yaml.compose(text, Loader=yaml.SafeLoader)
+        node = yaml.compose(text, Loader=_Loader)
         return None if node is None else _plain(node, "", name, lines)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
@@ -42,20 +41,26 @@ def parse_yaml(text: str, name: str, lines: dict[str, int]) -> Any:
         raise InputError(f"{name}: not valid YAML: {' '.join(str(error).split())}") from None
 
 
-def _require_flat(text: str, name: str) -> None:
-    """Raise InputError for YAML that is too deep or too large, before its tree is built.
+class _Loader(yaml.SafeLoader):
+    """Composes trees without aliases, a few lines of which can expand to any number of values."""
 
-    Aliases are refused, because a few lines of them can expand to any number of values.
-    """
-    depth = count = 0
-    for event in yaml.parse(text, Loader=yaml.SafeLoader):
-        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-        count += 1
-        line = event.start_mark.line + 1
+    def __init__(self, text: str) -> None:
+        super().__init__(text)
+        self._depth = self._count = 0
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        event = self.peek_event()
+        self._depth, self._count = self._depth + 1, self._count + 1
+        problem = ""
         if isinstance(event, yaml.AliasEvent):
-            raise InputError(f"{name}:{line}: an alias (*{event.anchor:.40}) is not taken here: write the value out")
-        if depth > MAX_DEPTH or count > MAX_EVENTS:
-            raise InputError(f"{name}:{line}: deeper or longer than any file of settings")
+            problem = "an alias is not taken: write the value out"
+        elif self._depth > MAX_DEPTH or self._count > MAX_NODES:
+            problem = "too deep or too long for settings"
+        if problem:
+            raise yaml.MarkedYAMLError(problem=problem, problem_mark=event.start_mark)
+        node = super().compose_node(parent, index)
+        self._depth -= 1
+        return node
 
 
 def _plain(node: yaml.Node, place: str, name: str, lines: dict[str, int]) -> Any:

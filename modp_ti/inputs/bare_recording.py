@@ -6,6 +6,7 @@ The tracker is `klt`, or that of the capture or bag if its poses come with the i
 from __future__ import annotations
 
 import itertools
+import os
 import re
 from collections.abc import Callable, Collection, Iterable
 from contextlib import suppress
@@ -15,7 +16,6 @@ from urllib.parse import urlsplit
 
 from modp_ti.config.scene_file import load_scene, scene_from_data
 from modp_ti.config.settings import SceneConfig
-from modp_ti.files import exists, is_file
 from modp_ti.files.errors import InputError, UnreadableImageError
 from modp_ti.files.file_tree import ARCHIVES
 from modp_ti.files.terminal import require_text
@@ -49,7 +49,7 @@ def is_recording(path: Path) -> bool:
     """Whether the argument of `modp-ti run` is a recording and not a scene file: a folder, video, archive or bag."""
     if path.is_dir() or path.suffix.lower() in RECORDING_SUFFIXES:
         return True
-    return path.suffix.lower() not in SCENE_SUFFIXES and is_file(path) and is_video(path)
+    return path.suffix.lower() not in SCENE_SUFFIXES and os.path.isfile(path) and is_video(path)
 
 
 def base_of(path: Path) -> Path:
@@ -70,9 +70,9 @@ def named_scene(
         InputError: As for both; or if it is a URL, one picture or an archive.
     """
     suffix = path.suffix.lower()
-    if re.match("[A-Za-z][A-Za-z0-9+]+:/", str(path)) and not exists(path):
+    if re.match("[A-Za-z][A-Za-z0-9+]+:/", str(path)) and not os.path.exists(path):
         raise InputError("a URL is mapped as a stream: modp-ti run --stream URL; or download the file")
-    if is_file(path) and suffix in (*IMAGE_SUFFIXES, *NOT_READ) and suffix not in VIDEO_SUFFIXES:
+    if os.path.isfile(path) and suffix in (*IMAGE_SUFFIXES, *NOT_READ) and suffix not in VIDEO_SUFFIXES:
         raise InputError(f"{path}: is one picture: name the folder of all pictures")
     if suffix in PACKED:
         raise InputError(f"{path}: is an archive that is not read: unpack it, and name the folder")

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import inverse_se3
-from modp_ti.files import LARGEST, limited_lines, readable
+from modp_ti.files import LARGEST, limited_lines, reading
 from modp_ti.files.errors import InputError
 from modp_ti.files.file_tree import FileTree
 from modp_ti.files.trajectory import checked_pose
@@ -175,7 +175,7 @@ def read_lines(tree: FileTree, name: str) -> list[tuple[int, str]]:
     Raises:
         InputError: If it cannot be read.
     """
-    with readable(tree.path / name, " (source.path)"):
+    with reading(tree.path / name, " (source.path)"):
         text = io.StringIO(tree.read_text(name))
         numbered = enumerate((line.partition("#")[0].strip() for line in limited_lines(text)), 1)
         return [(number, line) for number, line in numbered if line]

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.geometry.se3 import matrices_from_unit_quaternions
-from modp_ti.files import input_lines, read_bytes, readable
+from modp_ti.files import input_lines, read_bytes, reading
 from modp_ti.files.errors import InputError
 
 # Name and number of parameters of each camera model, by its number in binary files.
@@ -146,7 +146,7 @@ class _Cursor:
     """A position in a file. Moving it beyond the end raises InputError."""
 
     def __init__(self, file: Path) -> None:
-        with readable(file):
+        with reading(file):
             self.data = read_bytes(file)
         self.file = file
         self.at = 0

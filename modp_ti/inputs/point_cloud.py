@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.frames.tracked_frame import SparsePoints
-from modp_ti.files import limited_lines, open_file, read_bytes, readable
+from modp_ti.files import limited_lines, open_file, read_bytes, reading
 from modp_ti.files.errors import InputError
-from modp_ti.files.limits import array_of
 from modp_ti.files.number_rows import read_number_rows
 from modp_ti.files.ply import parse_ply_header
 from modp_ti.files.trajectory import FARTHEST
@@ -36,7 +35,7 @@ def read_point_file(path: Path) -> NDArray[np.float64]:
     Raises:
         InputError: If the file is none of these or has no points. For text, the message names the line.
     """
-    with readable(path, " (tracker.points)"), open_file(path) as file:
+    with reading(path, " (tracker.points)"), open_file(path) as file:
         start = file.read(PCD_START)
     if start.startswith(b"ply"):
         xyz = read_ply_points(path)
@@ -60,7 +59,7 @@ def read_ply_points(path: Path) -> NDArray[np.float64]:
     Raises:
         InputError: If the file is missing, damaged, or lacks x, y and z.
     """
-    with readable(path):
+    with reading(path):
         data = read_bytes(path)
     header = parse_ply_header(data, path)
     if not set("xyz") <= set(header.names):
@@ -95,10 +94,8 @@ def read_npy_points(path: Path) -> NDArray[np.float64]:
     Raises:
         InputError: If the file is damaged, or its array is none of points.
     """
-    try:
-        xyz = array_of(read_bytes(path))
-    except (OSError, ValueError):
-        raise InputError(f"{path}: damaged, cut off, or no array of numbers") from None
+    with reading(path):
+        xyz = np.load(io.BytesIO(read_bytes(path)), allow_pickle=False)
     if xyz.ndim != 2 or xyz.shape[1] < 3 or xyz.dtype.kind not in "fiu":
         raise InputError(f"{path}: holds an array of shape {xyz.shape} and type {xyz.dtype} instead of (N, 3) numbers")
     with np.errstate(all="ignore"):  # converting a signalling NaN to float64 warns

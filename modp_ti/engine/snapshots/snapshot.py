@@ -22,7 +22,7 @@ from fields.geometry.camera import PinholeCamera
 from fields.map.trajectory import Trajectory
 from modp_ti.files.atomic import replacing
 from modp_ti.files.errors import InputError
-from modp_ti.files.reading import open_file, readable, reading
+from modp_ti.files.reading import open_file, reading
 from modp_ti.inputs.delivered_frames import DeliveredFrames
 from modp_ti.outputs.evaluation import MapVersion
 from modp_ti.outputs.report.record import FrameNote, RunRecord, StepNote
@@ -143,7 +143,7 @@ class Snapshot:
     @classmethod
     def read(cls, path: Path) -> Snapshot:
         """Read a snapshot. Raises InputError with one line if the file is missing, damaged or of another version."""
-        with reading(path, AGAIN), readable(path):
+        with reading(path, AGAIN):
             with open_file(path) as file, np.load(file, allow_pickle=False) as archive:
                 arrays = {name: archive[name] for name in archive.files}
             about = json.loads(bytes(arrays.pop(ABOUT)))

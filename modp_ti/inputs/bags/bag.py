@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -11,9 +12,8 @@ from pathlib import Path
 from threading import Lock
 from typing import TYPE_CHECKING, Any
 
-from modp_ti.files import is_file, open_file, readable
+from modp_ti.files import open_file, reading
 from modp_ti.files.errors import InputError
-from modp_ti.files.reading import reading
 from modp_ti.inputs.bags.unpacking import is_packed, limit_unpacking, unpacked
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ def is_bag(path: Path) -> bool:
     """Whether the path is a file with a bag's suffix, or a folder that ROS 2 has recorded, or that holds only a bag."""
     if path.is_dir():
         files = _files(path)
-        if is_file(path / "metadata.yaml"):
+        if os.path.isfile(path / "metadata.yaml"):
             return bool(files)
         whole = {re.sub("_[0-9]+$", "", file.stem) if file.suffix != ".bag" else file.stem for file in files}
         return len(whole) == 1 and set(files) == set(path.iterdir())
@@ -82,7 +82,7 @@ def _files(path: Path) -> list[Path]:
     """Return the files of a bag, in the order of their numbers."""
     if not path.is_dir():
         return [path]
-    found = [file for file in path.iterdir() if file.suffix in SUFFIXES and is_file(file)]
+    found = [file for file in path.iterdir() if file.suffix in SUFFIXES and os.path.isfile(file)]
     return sorted(found, key=lambda file: (len(file.name), file.name))
 
 
@@ -128,7 +128,7 @@ class Bag:
         self._readers: list[Reader1 | Reader2] = []
         try:
             for file in files:
-                with readable(file, " (source.path)"), open_file(file):
+                with reading(file, " (source.path)"), open_file(file):
                     pass
                 if file.suffix == ".db3" and set(str(file)) & set("?#%"):
                     raise InputError(f"{file}: SQLite cannot open a path with ?, # or %: rename it (source.path)")

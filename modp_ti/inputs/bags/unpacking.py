@@ -6,7 +6,7 @@ import bz2
 import sys
 from typing import Any
 
-from modp_ti.files.limits import most_unpacked
+from modp_ti.files.reading import most_unpacked
 
 MAX_RATIO = 100  # of a chunk, which may hold dark images
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"

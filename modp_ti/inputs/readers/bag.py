@@ -12,7 +12,7 @@ from pydantic import Field
 
 from fields.geometry.se3 import inverse_poses
 from modp_ti.files.errors import InputError
-from modp_ti.files.file_tree import FileTree, Folder
+from modp_ti.files.file_tree import FileTree
 from modp_ti.inputs.bags.bag import CLOUD, POSES, SUFFIXES, has_poses, is_bag
 from modp_ti.inputs.bags.clouds import world_points
 from modp_ti.inputs.bags.depth_images import DepthTopic, depth_topics, read_depth_topic, with_depth_points
@@ -102,7 +102,7 @@ class BagSettings(TrackerSettings):
 
     @classmethod
     def recognises(cls, tree: FileTree) -> bool:
-        return isinstance(tree, Folder) and is_bag(tree.path)
+        return tree.is_folder and is_bag(tree.path)
 
     @classmethod
     def open_images(cls, path: Path, source: SourceSettings) -> ImageSource:

@@ -10,7 +10,7 @@ from pydantic import Field
 from fields.geometry.se3 import inverse_se3
 from modp_ti.files.errors import InputError
 from modp_ti.files.file_tree import FileTree
-from modp_ti.files.reading import readable
+from modp_ti.files.reading import reading
 from modp_ti.files.trajectory import poses_of_quaternions
 from modp_ti.files.yaml_text import parse_yaml
 from modp_ti.inputs.capture import (
@@ -98,7 +98,7 @@ def _top(tree: FileTree) -> str | None:
 
 def _sensor(tree: FileTree, name: str) -> dict[str, Any]:
     """Read the camera's YAML. Some have OpenCV's first line and tags, which are not those of YAML."""
-    with readable(tree.path / name, " (source.path)"):
+    with reading(tree.path / name, " (source.path)"):
         text = tree.read_text(name)
     plain = "\n".join("" if line.startswith("%YAML") else line for line in text.splitlines())
     data = parse_yaml(plain.replace("!!opencv-matrix", ""), str(tree.path / name), {})

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field
 
 from modp_ti.files.errors import InputError
-from modp_ti.files.file_tree import FileTree, Folder
+from modp_ti.files.file_tree import FileTree
 from modp_ti.inputs.capture import (
     Capture,
     CapturedFrame,
@@ -93,5 +93,5 @@ def _projection(tree: FileTree, camera: int) -> np.ndarray:
 
 def _poses_file(tree: FileTree) -> tuple[FileTree, str]:
     """Return the file of the poses, which need not be there, and the folder that it lies in."""
-    name, above = f"poses/{tree.path.resolve().name}.txt", Folder(tree.path.resolve().parent.parent)
+    name, above = f"poses/{tree.path.resolve().name}.txt", FileTree(tree.path.resolve().parent.parent)
     return (tree, "poses.txt") if tree.has("poses.txt") else (above, name)

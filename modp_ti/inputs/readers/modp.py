@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from fields.geometry.camera import PinholeCamera
-from modp_ti.files import LARGEST, open_file, readable
+from modp_ti.files import LARGEST, open_file, reading
 from modp_ti.files.errors import InputError
-from modp_ti.files.file_tree import FileTree, Folder
+from modp_ti.files.file_tree import FileTree
 from modp_ti.files.number_rows import read_number_rows
 from modp_ti.files.trajectory import checked_pose
 from modp_ti.inputs.given_poses import found_file, matched_entries, posed_images, read_entries
@@ -89,7 +89,7 @@ class ModpSettings(RecordedSettings):
 
     @classmethod
     def recognises(cls, tree: FileTree) -> bool:
-        return isinstance(tree, Folder) and (tree.path / IMAGES).is_dir()
+        return tree.is_folder and (tree.path / IMAGES).is_dir()
 
     @classmethod
     def open_images(cls, path: Path, source: SourceSettings) -> ImageFolder:
@@ -142,7 +142,7 @@ def _cloud_files(folder: Path) -> dict[int, Path]:
 def _read_cloud(path: Path) -> NDArray[np.float64]:
     """Read world points (N, 3). An empty text file has none."""
     if path.suffix.lower() == ".txt":
-        with readable(path), open_file(path) as file:
+        with reading(path), open_file(path) as file:
             if not file.read(1):
                 return np.zeros((0, 3))
         return read_number_rows(path, 3, "x y z", "the point files beside tracker.path", more=True).values

@@ -13,7 +13,7 @@ from pydantic import Field
 from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import inverse_poses
 from modp_ti.files.errors import InputError
-from modp_ti.files.file_tree import FileTree, Folder
+from modp_ti.files.file_tree import FileTree
 from modp_ti.files.number_rows import read_number_rows
 from modp_ti.files.trajectory import checked_pose
 from modp_ti.inputs.given_poses import found_file, missing_frames_note, replay_poses, selected_frames
@@ -68,12 +68,12 @@ class ReplicaSettings(GivenPosesSettings):
 
     @classmethod
     def recognises(cls, tree: FileTree) -> bool:
-        return isinstance(tree, Folder) and any(map(IMAGE.fullmatch, tree.listed(IMAGES)))
+        return tree.is_folder and any(map(IMAGE.fullmatch, tree.listed(IMAGES)))
 
     @classmethod
     def open_images(cls, path: Path, source: SourceSettings) -> ListedImages:
         """Open `results/frame*.jpg`, which lie among depth pictures. The time of an image is position / fps."""
-        found = filter(None, map(IMAGE.fullmatch, Folder(path).listed(IMAGES)))
+        found = filter(None, map(IMAGE.fullmatch, FileTree(path).listed(IMAGES)))
         names = sorted((match[1] for match in found), key=natural_key)
         if not names:
             raise InputError(

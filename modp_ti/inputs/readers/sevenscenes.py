@@ -13,7 +13,7 @@ from pydantic import Field
 from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import inverse_poses
 from modp_ti.files.errors import InputError
-from modp_ti.files.file_tree import FileTree, Folder
+from modp_ti.files.file_tree import FileTree
 from modp_ti.files.number_rows import read_number_rows
 from modp_ti.files.trajectory import checked_pose
 from modp_ti.inputs.given_poses import missing_frames_note, replay_poses, selected_frames
@@ -79,7 +79,7 @@ class SevenScenesSettings(GivenPosesSettings):
 
     @classmethod
     def recognises(cls, tree: FileTree) -> bool:
-        return isinstance(tree, Folder) and bool(_images(tree.path))
+        return tree.is_folder and bool(_images(tree.path))
 
     @classmethod
     def open_images(cls, path: Path, source: SourceSettings) -> ListedImages:
@@ -104,7 +104,7 @@ def _images(path: Path) -> dict[int, Path]:
     """Return the colour images by frame number, from the folder or its subfolder `images`."""
     found: dict[int, Path] = {}
     for folder in ("", "images"):
-        for match in [] if found else filter(None, map(FRAME.fullmatch, Folder(path).listed(folder))):
+        for match in [] if found else filter(None, map(FRAME.fullmatch, FileTree(path).listed(folder))):
             other = found.setdefault(int(match[1]), path / match[0])
             if other != path / match[0]:
                 raise InputError(f"{path / match[0]}: {other.name} has the same frame number; take one of them out")

@@ -16,7 +16,7 @@ from pydantic import Field
 
 from fields.frames.tracked_frame import SparsePoints
 from fields.geometry.camera import PinholeCamera
-from modp_ti.files import LARGEST, open_file, readable
+from modp_ti.files import LARGEST, open_file, reading
 from modp_ti.files.errors import InputError
 from modp_ti.files.trajectory import poses_of_quaternions
 from modp_ti.inputs.given_poses import found_file, posed_images
@@ -176,7 +176,7 @@ def read_stella_map(path: Path) -> _Map:
     Raises:
         InputError: If the file is missing, truncated, damaged, or has no keyframes or landmarks.
     """
-    with readable(path, " (tracker.path)"), open_file(path) as file:
+    with reading(path, " (tracker.path)"), open_file(path) as file:
         if file.read(16).startswith(b"SQLite format 3"):
             raise InputError(
                 f"{path}: an SQLite map; let stella_vslam write MessagePack: MapFormat: msgpack in its "

@@ -9,8 +9,8 @@ import numpy as np
 from pydantic import Field
 
 from modp_ti.files.errors import InputError
-from modp_ti.files.file_tree import FileTree, Folder
-from modp_ti.files.reading import limited_lines, readable
+from modp_ti.files.file_tree import FileTree
+from modp_ti.files.reading import limited_lines, reading
 from modp_ti.files.trajectory import poses_of_quaternions
 from modp_ti.inputs.capture import (
     Capture,
@@ -40,7 +40,7 @@ class StrayScannerSettings(DepthCaptureSettings):
 
     @classmethod
     def recognises(cls, tree: FileTree) -> bool:
-        return isinstance(tree, Folder) and tree.has(TABLE) and tree.has(VIDEO)  # a video cannot be read in an archive
+        return tree.is_folder and tree.has(TABLE) and tree.has(VIDEO)  # a video cannot be read in an archive
 
     @classmethod
     def read(cls, tree: FileTree) -> Capture:
@@ -75,7 +75,7 @@ class StrayScannerSettings(DepthCaptureSettings):
 
 def _table(tree: FileTree, name: str) -> tuple[list[str], list[list[str]], list[int]]:
     """Read a table: the names of its columns, and the words of each row with its line."""
-    with readable(tree.path / name, " (source.path)"):
+    with reading(tree.path / name, " (source.path)"):
         lines = list(limited_lines(io.StringIO(tree.read_text(name))))
     words = [[word.strip() for word in line.split(",")] for line in lines]
     numbers = [n for n, row in enumerate(words) if n and any(row)]
@@ -94,7 +94,7 @@ def _numbers(row: list[str], places: list[int], where: str) -> list[float]:
 
 def _matrix(tree: FileTree) -> list[float]:
     """Return fx, fy, cx and cy of the file that holds one matrix for all frames."""
-    with readable(tree.path / MATRIX, " (source.path)"):
+    with reading(tree.path / MATRIX, " (source.path)"):
         text = tree.read_text(MATRIX).replace(",", " ").split()
     try:
         values = [float(word) for word in text]

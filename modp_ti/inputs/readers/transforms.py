@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
@@ -14,7 +15,6 @@ from pydantic import Field
 
 from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import inverse_se3
-from modp_ti.files import is_file
 from modp_ti.files.errors import InputError
 from modp_ti.files.trajectory import checked_pose
 from modp_ti.inputs.capture import OPENCV_OPENGL
@@ -91,7 +91,7 @@ class TransformsSettings(RecordedSettings):
 
         cloud = data.get("ply_file_path")
         cloud = cloud.replace("\\", "/") if isinstance(cloud, str) else None  # as Windows writes it
-        if cloud is not None and is_file(file.parent / cloud):
+        if cloud is not None and os.path.isfile(file.parent / cloud):
             xyz = read_ply_points(file.parent / cloud)
             frames = [f.with_points(visible_points(xyz, f.undistorter, f.T_camera_world)) for f in frames]
         else:

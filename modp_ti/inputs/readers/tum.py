@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 from pydantic import Field
 
 from fields.geometry.camera import PinholeCamera
-from modp_ti.files import LARGEST, input_lines, is_file
+from modp_ti.files import LARGEST, input_lines
 from modp_ti.files.errors import InputError
 from modp_ti.files.file_tree import FileTree
 from modp_ti.inputs.given_poses import found_file
@@ -70,7 +71,7 @@ class TumSettings(TrajectorySettings):
         """Open the images of a sequence that `rgb.txt` lists and that exist, with the times of the listing."""
         listing = path / LISTING
         entries = _read_listing(listing)
-        there = [(time, name) for time, name in entries if is_file(path / name)]
+        there = [(time, name) for time, name in entries if os.path.isfile(path / name)]
         if not there:
             raise InputError(
                 f"{listing}: none of its {len(entries)} images is there, the first is {entries[0][1]}: "

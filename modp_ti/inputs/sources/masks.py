@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from numpy.typing import NDArray
 
-from modp_ti.files import read_bytes, readable
+from modp_ti.files import read_bytes, reading
 from modp_ti.files.errors import InputError, UnreadableImageError
 from modp_ti.inputs.sources.image_folder import ImageFolder
 from modp_ti.inputs.sources.image_header import why_undecodable
@@ -126,7 +126,7 @@ def read_vignette(path: Path) -> NDArray[np.float32]:
     """
     import cv2
 
-    with readable(path, "; it should be the vignette (source.vignette)"):
+    with reading(path, "; it should be the vignette (source.vignette)"):
         data = read_bytes(path)
     reason = why_undecodable(data)
     if data and reason is not None:

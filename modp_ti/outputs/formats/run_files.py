@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from fields.frames.origin import NO_ORIGIN, shifted_poses
 from fields.geometry.camera import PinholeCamera
 from fields.map.keyframes import KeyframeStore
-from modp_ti.files import LARGEST, read_bytes, read_json, readable, text_lines
+from modp_ti.files import LARGEST, read_bytes, read_json, reading, text_lines
 from modp_ti.files.atomic import replace_text, replacing
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.delivered_frames import DeliveredFrames
@@ -252,7 +252,7 @@ def read_masks(folder: Path) -> dict[int, NDArray[np.uint8]]:
     """
     masks = {}
     for path in sorted(folder.glob("*.png")):
-        with readable(path):
+        with reading(path):
             data = read_bytes(path)
         reason = why_undecodable(data)
         mask = decoded_as(data, cv2.IMREAD_UNCHANGED) if reason is None else None
