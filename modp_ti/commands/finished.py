@@ -206,8 +206,7 @@ def view(
     """Show a finished map, or a .ply file of splats, as a web page, until Ctrl-C."""
     with outcome(as_json=False):
         from modp_ti.config.settings import ViewSettings
-        from modp_ti.outputs.playback.finished_run import open_run
-        from modp_ti.outputs.playback.splat_file import open_splats
+        from modp_ti.outputs.playback.finished_run import open_run, open_splats
         from modp_ti.outputs.progress import ProgressLine
         from modp_ti.outputs.viewer.finished import FinishedViewer
 

@@ -27,9 +27,8 @@ from modp_ti.outputs.evaluation import FrameScore, MapVersion, evaluate
 from modp_ti.outputs.formats.run_files import read_exposures, read_masks, read_scores, write_exposures
 from modp_ti.outputs.formats.splats_ply import check_splats, write_splats
 from modp_ti.outputs.lpips import open_lpips
-from modp_ti.outputs.playback.finished_frames import frames_of
 from modp_ti.outputs.playback.finished_run import FinishedRun, open_run
-from modp_ti.outputs.playback.run_pictures import kept_images, run_settings
+from modp_ti.outputs.playback.run_frames import frames_of, kept_images, run_settings
 from modp_ti.outputs.progress import ProgressLine
 from modp_ti.outputs.report.record import RunRecord
 from pipelines.online import OnlineMapper

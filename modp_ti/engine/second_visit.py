@@ -28,8 +28,8 @@ from modp_ti.outputs.locating.world_alignment import (
     image_motion,
     world_alignment,
 )
-from modp_ti.outputs.playback.finished_frames import FinishedFrames
 from modp_ti.outputs.playback.finished_run import open_run
+from modp_ti.outputs.playback.run_frames import FinishedFrames
 from modp_ti.outputs.progress import ProgressLine
 from pipelines.companions.changes import EarlierVisit
 from pipelines.whole.finished_map import FinishedMap

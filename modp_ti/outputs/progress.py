@@ -270,6 +270,8 @@ class ProgressLine:
         self.start(what, total)
         try:
             for item in items:
+                if self._progress is None:  # a tracker has shown how it prepares in its place
+                    self.start(what, total)
                 yield item
                 self.advance()
         finally:

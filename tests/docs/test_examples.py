@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from modp_ti.outputs.formats.points_ply import open3d
+from modp_ti.outputs.formats.mesh import open3d
 from modp_ti.outputs.formats.splats_ply import read_splats
 
 pytestmark = pytest.mark.slow

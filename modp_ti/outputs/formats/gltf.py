@@ -33,7 +33,7 @@ from PIL import Image
 
 from fields.map.gaussians import SH_C0
 from modp_ti.files.atomic import replace_file
-from modp_ti.outputs.formats.splat_packing import HALF_TURN, TURNED, opacities, to_bits, unit_quaternions
+from modp_ti.outputs.formats.compressed_splats import HALF_TURN, TURNED, opacities, to_bits, unit_quaternions
 
 POINTS, TRIANGLES, VERTICES, INDICES = 0, 4, 34962, 34963
 # componentType and whether integers stand for [0, 1], by the type of an array's numbers.

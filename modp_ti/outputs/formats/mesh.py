@@ -1,25 +1,28 @@
-"""Extracts the map's surface as a mesh by fusing depth views into a truncated signed distance field.
+"""The map as coloured points, and its surface as a mesh, fused from depth into a truncated signed distance field.
 
 The method is that of [Curless and Levoy 1996], in Open3D's sparse voxel block grid.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fields.frames.origin import NO_ORIGIN
 from fields.geometry.camera import PinholeCamera
 from fields.map.blocks import Boxes, planes_of, seen
+from fields.map.gaussians import SH_C0
 from modp_ti.files.atomic import written_aside
 from modp_ti.files.errors import InputError
+from modp_ti.outputs.formats.compressed_splats import HALF_TURN, opacities
 from modp_ti.outputs.formats.gltf import write_mesh_glb
-from modp_ti.outputs.formats.points_ply import open3d
-from modp_ti.outputs.formats.textured_mesh import TexturedMesh
 from pipelines.surface.fusion import integrate, supporting_views
 
 if TYPE_CHECKING:
@@ -50,6 +53,21 @@ VIEWS_OF_VERTEX, SHORT = 3, 16
 LEAST_PART = 0.002
 VIEWS_OF_SMALL, THROUGH_SMALL = 6, 0.5
 BLOCK = 8
+
+
+def open3d() -> ModuleType:
+    """Import and return Open3D.
+
+    Raises:
+        InputError: If the import fails, most often because of a missing system library.
+    """
+    try:
+        import open3d
+    except (ImportError, OSError) as error:
+        raise InputError(
+            f"Open3D does not start ({error}); on Debian or Ubuntu: apt-get install libusb-1.0-0 libgomp1 libgl1"
+        ) from None
+    return open3d
 
 
 @dataclass(frozen=True)
@@ -179,21 +197,17 @@ def supported(mesh: TriangleMesh, views: Sequence[SurfaceView], tolerance: float
     return mesh.remove_unreferenced_vertices()
 
 
-def write_mesh(path: Path, mesh: TriangleMesh | TexturedMesh) -> None:
+def write_mesh(path: Path, mesh: TriangleMesh) -> None:
     """Write a mesh with vertex colours as PLY, GLB or OBJ, by the suffix. The file appears whole or not at all.
 
     The axes are those of the poses. Only GLB, where y points up, is rotated by 180 degrees around x.
 
     Args:
         path: The file.
-        mesh: An Open3D TriangleMesh, or a mesh with a texture, which becomes GLB.
+        mesh: An Open3D TriangleMesh.
     """
-    turn = [1.0, -1.0, -1.0]
-    if isinstance(mesh, TexturedMesh):
-        write_mesh_glb(path, mesh.vertices * turn, mesh.triangles, uv=mesh.uv, image=mesh.image)
-        return
     if path.suffix.lower() == ".glb":
-        vertices, triangles = np.asarray(mesh.vertices) * turn, np.asarray(mesh.triangles)
+        vertices, triangles = np.asarray(mesh.vertices) * HALF_TURN, np.asarray(mesh.triangles)
         write_mesh_glb(path, vertices, triangles, np.asarray(mesh.vertex_colors))
         return
     o3d = open3d()
@@ -204,17 +218,21 @@ def write_mesh(path: Path, mesh: TriangleMesh | TexturedMesh) -> None:
             raise OSError(None, "Open3D could not write the mesh")
 
 
-def read_mesh(path: Path) -> TriangleMesh:
-    """Read an Open3D TriangleMesh.
+def write_points(
+    path: str | os.PathLike[str], state: Mapping[str, NDArray], origin: NDArray[np.float64] = NO_ORIGIN
+) -> None:
+    """Write the centres of the opaque Gaussians with their constant colours as binary PLY.
 
-    Raises:
-        InputError: If the file is missing or holds no triangles.
+    Args:
+        path: The file.
+        state: Gaussians by name, as from `GaussianField.to_numpy`.
+        origin: Where their origin lies in the world (3,), which the points are written in.
     """
     o3d = open3d()
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; modp-ti export OUT --format mesh makes a mesh")
-    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        mesh = o3d.io.read_triangle_mesh(str(path))
-    if len(mesh.triangles) == 0:
-        raise InputError(f"{path}: holds no triangle; modp-ti export OUT --format mesh makes a mesh")
-    return mesh
+    solid = opacities(state) >= LEAST_OPACITY  # the others are haze rather than surface
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(state["position"][solid].astype(np.float64) + origin))
+    colours = np.clip(0.5 + SH_C0 * state["sh"][solid, 0].astype(np.float64), 0.0, 1.0)
+    cloud.colors = o3d.utility.Vector3dVector(colours)
+    with written_aside(Path(path)) as partial:
+        if not o3d.io.write_point_cloud(str(partial), cloud):
+            raise OSError(None, "Open3D could not write the points")

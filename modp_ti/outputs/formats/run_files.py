@@ -7,8 +7,7 @@ import dataclasses
 import json
 import math
 import os
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -25,7 +24,6 @@ from modp_ti.files.atomic import replace_text, replacing
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.delivered_frames import DeliveredFrames
 from modp_ti.inputs.sources.distortion import NO_DISTORTION, Distortion
-from modp_ti.inputs.sources.image_header import why_undecodable
 from modp_ti.inputs.sources.image_pixels import decoded_as
 from modp_ti.inputs.sources.intrinsics import Intrinsics, require_plausible
 from modp_ti.inputs.sources.undistortion import Undistorter
@@ -81,15 +79,6 @@ def write_map(
     masks = {places[view.index]: view.transient for view in keyframes if view.transient is not None}
     if masks:
         write_masks(folder / "masks", masks)
-
-
-@contextmanager
-def _of_a_run(path: Path, what: str) -> Iterator[None]:
-    """Turn what reading a damaged file raises into one InputError."""
-    try:
-        yield
-    except (ValueError, KeyError, TypeError, OverflowError) as error:
-        raise InputError(f"{path}: cannot be read as the {what} of a run: {error!r:.80}") from None
 
 
 # ---- frames.json: facts that later commands need and no other file contains --------------------------------------
@@ -149,36 +138,22 @@ def read_frames(path: Path, count: int) -> FramesRecord:
     Raises:
         InputError: If the file is damaged or does not fit `count`.
     """
-    with _of_a_run(path, "frames"):
+    with reading(path):
         data = read_json(path, "of a finished run")
-        record = FramesRecord(
-            float(data["near"]),
-            float(data["scene_depth"]),
-            list(data["keyframes"]),
-            list(data["held_out"]),
-            _stored_camera(data["stored_camera"], path) if "stored_camera" in data else None,
-            np.array(data.get("origin", NO_ORIGIN), dtype=np.float64).reshape(3),
-        )
-        if not np.isfinite(record.origin).all():
-            raise ValueError("origin must be three finite numbers")
-        if not (0 < record.near < math.inf and 0 < record.scene_depth < math.inf and record.keyframes):
-            raise ValueError("near and scene_depth must be positive, and keyframes must name some")
-        indices = [*record.keyframes, *record.held_out]
-        if not all(type(index) is int and 0 <= index < count for index in indices):
-            raise ValueError(f"names frames beyond the {count} that trajectory.txt has")
+        stored = None
+        if (given := data.get("stored_camera")) is not None:
+            lens: dict[str, Any] = {
+                name: tuple(v) if isinstance(v, list) else v for name, v in given["distortion"].items()
+            }
+            camera = PinholeCamera(**{name: value for name, value in given.items() if name != "distortion"})
+            stored = Intrinsics(*require_plausible(camera, Distortion(**lens), f"{path}: stored_camera"))
+        origin = np.array(data.get("origin", NO_ORIGIN), dtype=np.float64).reshape(3)
+        record = FramesRecord(data["near"], data["scene_depth"], data["keyframes"], data["held_out"], stored, origin)
+        if not (0 < record.near < math.inf and 0 < record.scene_depth < math.inf and np.isfinite(origin).all()):
+            raise ValueError("near, scene_depth or origin is no length")
+        if not record.keyframes or not set(record.keyframes + record.held_out) <= set(range(count)):
+            raise ValueError(f"keyframes and held_out must be among the {count} frames that trajectory.txt has")
         return record
-
-
-def _stored_camera(data: Mapping[str, Any], path: Path) -> Intrinsics:
-    lens = data["distortion"]
-    numerator, denominator = (tuple(map(float, lens[name])) for name in ("numerator", "denominator"))
-    p1, p2 = map(float, lens["tangential"])
-    fx, fy, cx, cy = (float(data[name]) for name in ("fx", "fy", "cx", "cy"))
-    camera = PinholeCamera(fx, fy, cx, cy, int(data["width"]), int(data["height"]))
-    more = {name: value for name, value in lens.items() if name not in LENS}
-    s1, s2, s3, s4 = map(float, more.pop("prism", NO_DISTORTION.prism))
-    distortion = Distortion(numerator, denominator, (p1, p2), bool(lens["fisheye"]), (s1, s2, s3, s4), **more)
-    return Intrinsics(*require_plausible(camera, distortion, f"{path}: stored_camera"))
 
 
 # ---- exposure.json: the estimated exposure of every frame --------------------------------------------------------
@@ -221,7 +196,7 @@ def read_exposures(path: Path) -> dict[int, NDArray[np.float64]]:
     """
     if not path.is_file():
         return {}
-    with _of_a_run(path, "exposures"):
+    with reading(path):
         frames = read_json(path, "of a finished run")["frames"]
         found = {int(frame["index"]): np.array(frame["matrix"], dtype=np.float64).reshape(3, 4) for frame in frames}
         if not all((np.abs(matrix) <= LARGEST).all() for matrix in found.values()):
@@ -253,12 +228,10 @@ def read_masks(folder: Path) -> dict[int, NDArray[np.uint8]]:
     masks = {}
     for path in sorted(folder.glob("*.png")):
         with reading(path):
-            data = read_bytes(path)
-        reason = why_undecodable(data)
-        mask = decoded_as(data, cv2.IMREAD_UNCHANGED) if reason is None else None
-        if mask is None or mask.ndim != 2 or mask.dtype != np.uint8 or not path.stem.isdecimal():
-            raise InputError(f"{path}: no mask of a run: {reason or 'it must be a grey image, named by its frame'}")
-        masks[int(path.stem)] = mask
+            mask = decoded_as(read_bytes(path), cv2.IMREAD_UNCHANGED)
+            if mask is None or mask.ndim != 2 or mask.dtype != np.uint8:
+                raise ValueError("it must be a grey image")
+            masks[int(path.stem)] = mask
     return masks
 
 
@@ -285,23 +258,16 @@ def read_scores(path: str | os.PathLike[str]) -> list[FrameScore]:
     Raises:
         InputError: If the file is not valid. The message names the line.
     """
-    file = Path(path)
-    try:
-        rows = list(csv.reader(text_lines(file)))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        reason = error.strerror if isinstance(error, OSError) else error
-        raise InputError(f"{file}: cannot be read as scores: {reason}") from None
-    if not rows or rows[0] != COLUMNS:
-        raise InputError(f"{file}:1: the columns must be {','.join(COLUMNS)}")
-    scores = []
-    for number, row in enumerate(rows[1:], start=2):
+    scores: list[FrameScore] = []
+    with reading(path):
+        rows = csv.reader(text_lines(path))
+        if next(rows, None) != COLUMNS:
+            raise InputError(f"{path}:1: the columns must be {','.join(COLUMNS)}")
         try:
-            index, name, held_out, stage, *figures = row
-            psnr, ssim, lpips, detail = (float(value) if value else None for value in figures)
-            if psnr is None or ssim is None:
-                raise ValueError
-            held = {"0": False, "1": True}[held_out]
-            scores.append(FrameScore(int(index), name, held, stage, psnr, ssim, lpips, detail))
+            for index, name, held_out, stage, psnr, ssim, *others in rows:
+                lpips, detail = (float(value) if value else None for value in others)
+                held = {"0": False, "1": True}[held_out]
+                scores.append(FrameScore(int(index), name, held, stage, float(psnr), float(ssim), lpips, detail))
         except (ValueError, KeyError):
-            raise InputError(f"{file}:{number}: not a line of scores") from None
+            raise InputError(f"{path}:{len(scores) + 2}: not a line of scores") from None
     return scores

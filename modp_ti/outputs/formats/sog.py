@@ -37,7 +37,7 @@ from numpy.typing import NDArray
 
 from fields.map.blocks import Boxes, extent_of
 from modp_ti.files.atomic import replace_file
-from modp_ti.outputs.formats.splat_packing import morton_order, opacities, smallest_three, to_bits, unit_quaternions
+from modp_ti.outputs.formats.compressed_splats import morton_order, opacities, smallest_three, to_bits, unit_quaternions
 from pipelines.whole.hierarchy import LEVELS, Hierarchy, Level
 
 CODES = 256

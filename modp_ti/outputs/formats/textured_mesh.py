@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -12,7 +13,9 @@ from numpy.typing import NDArray
 
 from fields.geometry.camera import PinholeCamera
 from modp_ti.files.errors import InputError
-from modp_ti.outputs.formats.points_ply import open3d
+from modp_ti.outputs.formats.compressed_splats import HALF_TURN
+from modp_ti.outputs.formats.gltf import write_mesh_glb
+from modp_ti.outputs.formats.mesh import open3d
 from pipelines.surface.fusion import Paint
 
 if TYPE_CHECKING:
@@ -122,6 +125,11 @@ def painted(
     of_label[nearest[known]] = image[known]
     image = np.rint(255 * np.clip(of_label[nearest], 0, 1)).astype(np.uint8)
     return TexturedMesh(mesh.vertices, mesh.uv, mesh.triangles, image)
+
+
+def write_textured_mesh(path: str | os.PathLike[str], mesh: TexturedMesh) -> None:
+    """Write a textured mesh as GLB, rotated by 180 degrees around x, so that y points up."""
+    write_mesh_glb(path, mesh.vertices * HALF_TURN, mesh.triangles, uv=mesh.uv, image=mesh.image)
 
 
 def _scene(vertices: NDArray, triangles: NDArray) -> Any:

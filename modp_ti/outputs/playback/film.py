@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from itertools import chain
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -36,41 +37,22 @@ BT709, UNBIASED = 1, 0x4 | 0x40000 | 0x2000 | 0x4000
 # The depth colours range from the scene's depth divided by this factor to the depth times this factor.
 DEPTH_RANGE = 4.0
 PATHS = ("recorded", "smoothed", "orbit")
-# Number of pictures and frame rate of paths that do not define their own.
+# Number of pictures and frame rate of paths that do not define their own, and default smoothing [frames].
 DEFAULT_FRAMES = 240
 DEFAULT_FPS = 30.0
 DEVIATION = 5.0
 
 
 def is_video(path: Path) -> bool:
-    """Return whether the name asks for a video.
+    """Return whether a path names a video; otherwise it is a folder of pictures.
 
     Raises:
         InputError: If the suffix is that of another kind of file.
     """
     suffix = path.suffix.lower()
-    if suffix in VIDEO_SUFFIXES:
-        return True
     if suffix in (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".avi", ".mov", ".mkv", ".gif"):
         raise InputError(f"{path}: give a name in .mp4 or .webm for a video, or a folder for pictures")
-    return False
-
-
-def require_writable(path: Path) -> None:
-    """Check that a video or a folder of pictures can be created at `path`.
-
-    Raises:
-        InputError: If not.
-    """
-    if is_video(path):
-        if path.is_dir():
-            raise InputError(f"{path}: is a folder, not a video file; name another")
-    elif path.exists() and not path.is_dir():
-        raise InputError(f"{path}: is a file; name a new folder for the pictures, or a video in .mp4 or .webm")
-    elif path.is_dir() and any(path.iterdir()):
-        raise InputError(f"{path}: is not empty; name a new folder for the pictures")
-    if not path.absolute().parent.is_dir():
-        raise InputError(f"{path.absolute().parent}: no such folder; make it first")
+    return suffix in VIDEO_SUFFIXES
 
 
 def write_pictures(folder: Path, views: Iterable[RenderedView], depth: bool) -> None:
@@ -84,8 +66,6 @@ def write_pictures(folder: Path, views: Iterable[RenderedView], depth: bool) -> 
     Raises:
         InputError: If the files cannot be written.
     """
-    import cv2
-
     try:
         with new_folder(folder) as partial:
             for number, view in enumerate(views):
@@ -138,8 +118,6 @@ def depth_colours(view: RenderedView, scene_depth: float) -> NDArray[np.uint8]:
 
     The scale is logarithmic around `scene_depth`.
     """
-    import cv2
-
     z = view.expected_depth()
     near = 0.5 - 0.5 * np.log(np.maximum(z, 1e-12) / scene_depth) / np.log(DEPTH_RANGE)
     colours = cv2.applyColorMap(eight_bits(near), cv2.COLORMAP_TURBO)[..., ::-1]
@@ -186,35 +164,40 @@ def plan_flight(
         exposure: Apply each frame's exposure. Only for the recorded path.
 
     Raises:
-        InputError: If the path is unknown, its file is invalid, `frames` is given for a path with its own poses,
-            `deviation` for another path than a smoothed one, or the exposures are not available.
+        InputError: If the path is unknown, its file is invalid, an option is given that the path ignores, or the
+            exposures are not available.
     """
-    exposures = _exposures(run, path) if exposure else None
+    for option, given, of in (
+        ("--smooth", deviation is not None, ("smoothed",)),
+        ("--frames", frames is not None, ("smoothed", "orbit")),
+        ("--exposure", exposure, ("recorded",)),
+    ):
+        if given and path not in of:
+            raise InputError(f"{option}: is for --path {' and '.join(of)}, not for {path}: leave it out")
     times = None
-    if deviation is not None and path != "smoothed":
-        raise InputError(f"--smooth is for the path `smoothed`, not for {path}: leave it out")
+    cameras = [run.cameras[run.record.keyframes[0]]]
     if path == "smoothed":
-        deviation = DEVIATION if deviation is None else deviation
-        poses = smoothed(run.poses[run.way], frames or max(DEFAULT_FRAMES, len(run.way)), deviation)
+        count = frames or max(DEFAULT_FRAMES, len(run.way))
+        poses = smoothed(run.poses[run.way], count, DEVIATION if deviation is None else deviation)
     elif path == "orbit":
         poses = orbit(run.poses[run.record.keyframes], run.record.scene_depth, frames or DEFAULT_FRAMES)
+    elif path == "recorded":
+        times, poses, cameras = run.timestamps[run.way], run.poses[run.way], [run.cameras[i] for i in run.way]
+    elif (file := Path(path).expanduser()).is_file():
+        times, poses = read_trajectory(file)
+        poses = shifted_poses(poses, -run.record.origin)
     else:
-        if frames is not None:
-            raise InputError("--frames is for the paths `smoothed` and `orbit`: the others have poses of their own")
-        if path == "recorded":
-            times, poses = run.timestamps[run.way], run.poses[run.way]
-        elif Path(path).expanduser().is_file():
-            times, poses = read_trajectory(Path(path).expanduser())
-            poses = shifted_poses(poses, -run.record.origin)
-        else:
-            raise InputError(f"--path {path}: no such file, and none of {', '.join(PATHS)}")
+        raise InputError(f"--path {path}: no such file, and none of {', '.join(PATHS)}")
     if len(poses) == 0:
         raise InputError(f"--path {path}: holds no pose")
-    own = (
-        [run.cameras[i] for i in run.way] if path == "recorded" else [run.cameras[run.record.keyframes[0]]] * len(poses)
+    if len(cameras) < len(poses):
+        cameras *= len(poses)
+    return Flight(
+        poses,
+        [_lens(camera, size, fov) for camera in cameras],
+        fps or _rate(times),
+        _exposures(run) if exposure else None,
     )
-    cameras = [_lens(camera, size, fov) for camera in own]
-    return Flight(poses, cameras, fps or _rate(times), exposures)
 
 
 def film(run: FinishedRun, flight: Flight, output: Path, depth: bool, device: str, line: ProgressLine) -> None:
@@ -223,7 +206,7 @@ def film(run: FinishedRun, flight: Flight, output: Path, depth: bool, device: st
     Args:
         run: The finished run.
         flight: The planned flight.
-        output: A video file or a folder.
+        output: A video file or a new folder.
         depth: Render depth instead of colour.
         device: "cpu", "cuda", "vulkan", "metal" or "auto".
         line: Shows the progress.
@@ -231,7 +214,11 @@ def film(run: FinishedRun, flight: Flight, output: Path, depth: bool, device: st
     Raises:
         InputError: If the output cannot be written. This is checked before rendering.
     """
-    require_writable(output)
+    video = is_video(output)
+    if not output.absolute().parent.is_dir():
+        raise InputError(f"{output.absolute().parent}: no such folder; make it first")
+    if output.is_dir() if video else output.exists() and not (output.is_dir() and not any(output.iterdir())):
+        raise InputError(f"{output}: is there already; name a video in .mp4 or .webm, or a new folder for pictures")
     with line.working("loading the map"):
         gaussians = run.gaussians
         start_device(device)
@@ -245,22 +232,21 @@ def film(run: FinishedRun, flight: Flight, output: Path, depth: bool, device: st
             view = renderer.view(camera, T)
             yield view if exposure is None else replace(view, colour=view.colour @ exposure[:, :3].T + exposure[:, 3])
 
-    if not is_video(output):
+    def shown(view: RenderedView) -> NDArray[np.uint8]:
+        return depth_colours(view, run.record.scene_depth) if depth else eight_bits(view.colour)
+
+    if video:
+        write_video(output, map(shown, views()), flight.frames_per_second)
+    else:
         write_pictures(output, views(), depth)
-        return
-    show: Callable[[RenderedView], NDArray[np.uint8]]
-    show = (lambda v: depth_colours(v, run.record.scene_depth)) if depth else (lambda v: eight_bits(v.colour))
-    write_video(output, (show(view) for view in views()), flight.frames_per_second)
 
 
-def _exposures(run: FinishedRun, path: str) -> list[NDArray[np.float64]]:
-    """Return the exposure of every recorded frame. Raises InputError if unavailable or if the path is another one."""
-    if path != "recorded":
-        raise InputError(f"--exposure is of the recorded frames: --path {path} has none of its own")
+def _exposures(run: FinishedRun) -> list[NDArray[np.float64]]:
+    """Return the exposure of every recorded frame. Raises InputError if they are not available."""
     known = read_exposures(run.folder / "exposure.json")
     if not known:
         raise InputError(f"{run.folder}: no exposures were estimated (mapping.exposure.enabled): leave out --exposure")
-    if missing := [index for index in range(len(run)) if index not in known]:
+    if missing := [index for index in run.way.tolist() if index not in known]:
         raise InputError(f"{run.folder / 'exposure.json'}: frame {missing[0]} is missing")
     return [known[index] for index in run.way.tolist()]
 

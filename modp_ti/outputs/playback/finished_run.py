@@ -1,4 +1,4 @@
-"""`FinishedRun`: reads the output folder of a run for the commands that follow it."""
+"""`FinishedRun`: reads the output folder of a run, or a file of splats, for the commands that follow it."""
 
 from __future__ import annotations
 
@@ -14,14 +14,22 @@ from fields.geometry.camera import PinholeCamera
 from modp_ti.files.errors import InputError
 from modp_ti.files.reading import reading
 from modp_ti.files.run_folder import require_whole
-from modp_ti.inputs.colmap_model import read_colmap_model
+from modp_ti.inputs.colmap_model import ModelCamera, read_colmap_model
 from modp_ti.inputs.sources import NO_DISTORTION
 from modp_ti.inputs.sources.intrinsics import require_plausible
 from modp_ti.outputs.formats.run_files import FramesRecord, read_frames
 from modp_ti.outputs.formats.splats_ply import read_splats
 from modp_ti.outputs.formats.trajectory import read_trajectory
+from modp_ti.outputs.playback.camera_paths import looking_at
 
 NEEDED = ("config.yaml", "splats.ply", "trajectory.txt", "colmap", "frames.json")
+
+# Of a file of splats: the quantile of the distances from the centre that counts as the map's radius, and from where the
+# camera looks at the centre, in radii: above and in front of it, with y down and z ahead.
+RADIUS = 0.8
+PLACE = np.array([0.0, -0.5, -1.8])
+NEAR = 0.01
+CAMERA = PinholeCamera(640.0, 640.0, 480.0, 360.0, 960, 720)
 
 
 @dataclass(frozen=True)
@@ -29,12 +37,13 @@ class FinishedRun:
     """A map and its frames.
 
     Attributes:
-        folder: The run's output folder.
+        folder: The run's output folder, or the file of splats.
         names: Image names in the COLMAP model.
         timestamps: (N,) time stamps [s].
         poses: (N, 4, 4) refined T_camera_world, in coordinates from `record.origin`, as the Gaussians are.
         cameras: Camera of each frame.
         record: Near plane, scene depth, keyframes, held-out frames and origin.
+        splats: The Gaussians, where they have been read already.
     """
 
     folder: Path
@@ -43,6 +52,7 @@ class FinishedRun:
     poses: NDArray[np.float64]
     cameras: list[PinholeCamera]
     record: FramesRecord
+    splats: dict[str, NDArray[np.float32]] | None = None
 
     def __len__(self) -> int:
         return len(self.names)
@@ -54,10 +64,7 @@ class FinishedRun:
         Raises:
             InputError: If the file is damaged or the map is empty.
         """
-        state = read_splats(self.folder / "splats.ply")
-        if len(state["position"]) == 0:
-            raise InputError(f"{self.folder / 'splats.ply'}: the map holds no Gaussian")
-        return state
+        return self.splats if self.splats is not None else _some_splats(self.folder / "splats.ply")
 
     @cached_property
     def way(self) -> NDArray[np.int64]:
@@ -93,41 +100,55 @@ def open_run(folder: Path) -> FinishedRun:
         what = "not a folder" if folder.exists() else "no such folder; a run makes it at its end"
         raise InputError(f"{folder}: {what}: name the output folder of a finished run")
     require_whole(folder)
-    missing = [name for name in NEEDED if not (folder / name).exists()]
-    if len(missing) == len(NEEDED):
-        raise InputError(f"{folder}: no run has left anything here: name the output folder of a finished run")
-    if missing == ["frames.json"]:
-        raise InputError(
-            f"{folder}: an earlier version made it, without frames.json: run it again, "
-            f"modp-ti run {folder / 'config.yaml'}"
-        )
-    if missing:
-        raise InputError(f"{folder}: not the output of a finished run, {missing[0]} is missing")
+    if missing := [name for name in NEEDED if not (folder / name).exists()]:
+        raise InputError(f"{folder}: not the output folder of a finished run: {', '.join(missing)} is missing")
     with reading(folder):
         timestamps, poses = read_trajectory(folder / "trajectory.txt")
-        names, cameras = _read_model(folder / "colmap")
-        if len(names) != len(poses) or not names:
-            raise InputError(f"{folder}: trajectory.txt has {len(poses)} frames, colmap/ {len(names)}: not of one run")
+        model = read_colmap_model(folder / "colmap")
+        images = [model.images[number] for number in sorted(model.images)]
+        if len(images) != len(poses) or not images:
+            raise InputError(f"{folder}: trajectory.txt has {len(poses)} frames, colmap/ {len(images)}: not of one run")
+        for image in images:  # their names are paths below the folder of images
+            if not image.name or not {"..", "/"}.isdisjoint(PurePosixPath(image.name).parts):
+                raise InputError(f"{folder}: image {image.name!r} is no name below the folder of images")
+        cameras = {number: _pinhole(camera, f"{folder}: camera {number}") for number, camera in model.cameras.items()}
         record = read_frames(folder / "frames.json", len(poses))
-        return FinishedRun(folder, names, timestamps, shifted_poses(poses, -record.origin), cameras, record)
+        return FinishedRun(
+            folder,
+            [image.name for image in images],
+            timestamps,
+            shifted_poses(poses, -record.origin),
+            [cameras[image.camera] for image in images],
+            record,
+        )
 
 
-def _read_model(folder: Path) -> tuple[list[str], list[PinholeCamera]]:
-    """Return the names and cameras of the images, in order."""
-    model = read_colmap_model(folder)
-    images = [model.images[number] for number in sorted(model.images)]
-    of_id = {}
-    for number, camera in model.cameras.items():
-        what = f"{folder}: camera {number}"
-        try:
-            fx, fy, cx, cy = map(float, camera.params)
-            pinhole = PinholeCamera(fx, fy, cx, cy, camera.width, camera.height)
-        except (ValueError, TypeError) as error:
-            raise InputError(f"{what} is none of a run: {error}") from None
-        of_id[number], _ = require_plausible(pinhole, NO_DISTORTION, what)
-    for image in images:
-        # The names are used as paths for reading and for exports, so they must stay inside the image folder.
-        parts = PurePosixPath(image.name).parts
-        if not parts or parts[0] == "/" or ".." in parts or "\0" in image.name:
-            raise InputError(f"{folder}: image {image.name!r} is no name below the folder of images")
-    return [image.name for image in images], [of_id[image.camera] for image in images]
+def open_splats(path: Path) -> FinishedRun:
+    """Read a PLY file of splats as a run of one frame, from which the whole is seen.
+
+    Raises:
+        InputError: If the file is no PLY file of 3DGS, cannot be read, or holds no splat.
+    """
+    if path.suffix.lower() != ".ply":
+        raise InputError(f"{path}: splats are read from .ply; splat-transform converts other formats")
+    state = _some_splats(path)
+    centre = np.median(state["position"], axis=0).astype(np.float64)
+    radius = max(float(np.quantile(np.linalg.norm(state["position"] - centre, axis=1), RADIUS)), 1e-9)
+    T = looking_at(centre + radius * PLACE, centre, np.array([0.0, -1.0, 0.0]))
+    depth = radius * float(np.linalg.norm(PLACE))
+    record = FramesRecord(near=NEAR * depth, scene_depth=depth, keyframes=[0], held_out=[])
+    return FinishedRun(path, [path.name], np.zeros(1), T[None], [CAMERA], record, state)
+
+
+def _some_splats(path: Path) -> dict[str, NDArray[np.float32]]:
+    state = read_splats(path)
+    if len(state["position"]) == 0:
+        raise InputError(f"{path}: the map holds no Gaussian")
+    return state
+
+
+def _pinhole(camera: ModelCamera, what: str) -> PinholeCamera:
+    if camera.model != "PINHOLE":
+        raise InputError(f"{what}: a {camera.model} camera is none of a run")
+    fx, fy, cx, cy = camera.params
+    return require_plausible(PinholeCamera(fx, fy, cx, cy, camera.width, camera.height), NO_DISTORTION, what)[0]

@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import inverse_se3
 from modp_ti.config.settings import ViewSettings
-from modp_ti.files.errors import InputError
 from modp_ti.inputs.colmap_model import read_colmap_model
 from modp_ti.outputs.formats.run_files import read_exposures
 from modp_ti.outputs.playback.finished_run import FinishedRun
 from modp_ti.outputs.playback.map_renderer import MapRenderer, eight_bits, start_device
-from modp_ti.outputs.playback.run_pictures import kept_images, pictures
+from modp_ti.outputs.playback.run_frames import kept_images, pictures
 from modp_ti.outputs.viewer.handover import BrowserCamera, Latest
 from modp_ti.outputs.viewer.modes import MODES, SPLATS, Photograph, painter, pinhole_of, splats_of
 from modp_ti.outputs.viewer.page import Page, ShownFrame
@@ -138,9 +137,7 @@ class FinishedViewer:
     def _photograph(self, index: int) -> Photograph:
         """Return the kept image of a frame. Raises InputError if it is missing or damaged."""
         run, camera = self.run, self.run.cameras[index]
-        picture = next(pictures(run, wanted=[index]))
-        if picture.image.shape[:2] != (camera.height, camera.width):
-            raise InputError(f"{run.folder}: the image of {run.names[index]} has another size than its camera")
+        picture = next(pictures(run, [index]))
         rgba = np.dstack([eight_bits(picture.image), np.full(picture.image.shape[:2], 255, dtype=np.uint8)])
         if picture.mask is not None:
             rgba[~picture.mask] = 0

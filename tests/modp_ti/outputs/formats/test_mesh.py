@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,25 +9,21 @@ import numpy as np
 import pytest
 
 from fields.geometry.camera import PinholeCamera
-from fields.map.blocks import Boxes
 from modp_ti.files.errors import InputError
-from modp_ti.outputs.formats import mesh as mesh_module
 from modp_ti.outputs.formats.mesh import (
     TRUNCATION,
     SurfaceView,
     extracted,
     fused,
-    read_mesh,
+    open3d,
     supported,
     without_edges,
     write_mesh,
 )
-from modp_ti.outputs.formats.points_ply import open3d
-from tests.room import Room, look_at, pinhole, walk
+from tests.room import Room, pinhole, walk
 
 if TYPE_CHECKING:
     import open3d as o3d
-    from open3d.pybind.t.geometry import VoxelBlockGrid
 
 CAMERA = PinholeCamera(100.0, 100.0, 80.0, 60.0, 160, 120)
 COLOUR = np.float32([0.25, 0.5, 1.0])
@@ -141,47 +136,11 @@ def test_of_few_views_one_is_enough_for_a_large_part_and_not_for_a_small_one() -
     assert len(mesh.vertices) == len(sphere.vertices)
 
 
-def by_block(grid: VoxelBlockGrid) -> list[np.ndarray]:
-    """Blocks in the order of their place, and their values: Open3D's own order may differ from call to call."""
-    used = grid.hashmap().active_buf_indices().numpy()
-    blocks = grid.hashmap().key_tensor().numpy()[used]
-    order = np.lexsort(blocks.T)
-    return [blocks[order], *(grid.attribute(name).numpy()[used[order]] for name in ("tsdf", "weight", "color"))]
-
-
-def test_blocks_out_of_view_are_left_out_and_no_voxel_changes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Cameras that look into four directions see some of the blocks each."""
-    views = plane_views(np.array([0.0, 0.0, -1.0]), -1.2)
-    targets = ([1.0, 0.3, 1.0], [-1.0, -1.5, 1.0], [0.5, 0.0, -1.0])
-    views += [replace(views[0], T_camera_world=look_at(np.zeros(3), np.array(target))) for target in targets]
-    seen, shares = mesh_module.seen, []
-
-    def counted(planes: np.ndarray, boxes: Boxes) -> np.ndarray:
-        flags = seen(planes, boxes)
-        shares.append(flags.mean())
-        return flags
-
-    monkeypatch.setattr(mesh_module, "seen", counted)
-    some = by_block(fused(views, voxel=0.02, farthest=4.0))
-    monkeypatch.setattr(mesh_module, "seen", lambda planes, boxes: np.ones((1, len(boxes)), dtype=bool))
-    for values, of_all in zip(some, by_block(fused(views, voxel=0.02, farthest=4.0)), strict=True):
-        np.testing.assert_array_equal(values, of_all)
-    assert all(0.02 < share < 0.9 for share in shares)
-
-
 def test_views_of_nothing_are_refused() -> None:
     empty = np.zeros((120, 160), np.float32)
     nothing = SurfaceView(CAMERA, np.eye(4), empty, np.zeros((120, 160, 3), np.float32))
     with pytest.raises(InputError, match="surface"):
         fused([nothing], voxel=0.02, farthest=4.0)
-
-
-def test_a_file_without_triangles_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"none\.ply"):
-        read_mesh(tmp_path / "none.ply")
-    (tmp_path / "damaged.ply").write_text("ply\n")
-    with pytest.raises(InputError, match=r"damaged\.ply"):
-        read_mesh(tmp_path / "damaged.ply")
 
 
 @pytest.fixture(scope="module")

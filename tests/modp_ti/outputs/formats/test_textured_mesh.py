@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import builtins
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -12,10 +11,8 @@ import pytest
 import trimesh
 
 from fields.geometry.camera import PinholeCamera
-from modp_ti.files.errors import InputError
-from modp_ti.outputs.formats.mesh import write_mesh
-from modp_ti.outputs.formats.points_ply import open3d
-from modp_ti.outputs.formats.textured_mesh import TexturedMesh, painted, unwrapped
+from modp_ti.outputs.formats.mesh import open3d
+from modp_ti.outputs.formats.textured_mesh import TexturedMesh, painted, unwrapped, write_textured_mesh
 from tests.room import look_at
 
 pytest.importorskip("xatlas", reason="no wheel of xatlas for this Python")
@@ -56,7 +53,7 @@ def read_by_trimesh(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("read", [read_by_open3d, read_by_trimesh])
 def test_another_program_finds_the_colours_of_known_points(cube: TexturedMesh, tmp_path: Path, read) -> None:
-    write_mesh(tmp_path / "cube.glb", cube)
+    write_textured_mesh(tmp_path / "cube.glb", cube)
     corners, uv, image = read(tmp_path / "cube.glb")
     corners = corners * [1, -1, -1]  # y is up there
     height, width = image.shape[:2]
@@ -102,16 +99,3 @@ def test_many_triangles_are_simplified() -> None:
     assert 300 < len(done.triangles) <= 500
     assert np.linalg.norm(done.vertices, axis=1) == pytest.approx(1.0, abs=0.05)
     assert done.uv.min() >= 0 and done.uv.max() <= 1
-
-
-def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    real = builtins.__import__
-
-    def without(name: str, *rest):
-        if name == "xatlas":
-            raise ImportError(name)
-        return real(name, *rest)
-
-    monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(InputError, match=r"pip install 'modp-ti\[texture\]'"):
-        unwrapped(open3d().geometry.TriangleMesh.create_box())

@@ -17,9 +17,8 @@ from modp_ti.commands.app import app
 from modp_ti.config.settings import ViewSettings
 from modp_ti.outputs.formats.run_files import FramesRecord
 from modp_ti.outputs.formats.splats_ply import write_splats
-from modp_ti.outputs.playback.finished_run import FinishedRun
+from modp_ti.outputs.playback.finished_run import FinishedRun, open_splats
 from modp_ti.outputs.playback.map_renderer import MapRenderer
-from modp_ti.outputs.playback.splat_file import open_splats
 from modp_ti.outputs.viewer.finished import FinishedViewer
 from modp_ti.outputs.viewer.handover import BrowserCamera
 from modp_ti.outputs.viewer.modes import MODES, UNSEEN, Splats
