@@ -17,9 +17,9 @@ from hypothesis.extra import numpy as arrays
 
 from fields.geometry.se3 import exp_se3
 from modp_ti.files import parse_json
-from modp_ti.files.csv_columns import read_csv_blocks
 from modp_ti.files.number_rows import read_number_rows
 from modp_ti.inputs.point_cloud import read_ply_points
+from modp_ti.inputs.readers.aria import read_csv_blocks
 from modp_ti.inputs.tracker_server.messages import Kind, State, encoded, parse_correction, parse_frame
 from modp_ti.outputs.evaluation import FrameScore
 from modp_ti.outputs.formats.run_files import read_frames, read_scores, write_frames, write_scores
@@ -127,7 +127,7 @@ def test_columns(tmp_path: Path, rows: list[tuple[int, float]], packed: bool) ->
     writer.writerows(["x", value, number] for number, value in rows)
     path = tmp_path / ("rows.csv.gz" if packed else "rows.csv")
     path.write_bytes(gzip.compress(text.getvalue().encode()) if packed else text.getvalue().encode())
-    found = [tuple(row) for _, block in read_csv_blocks(path, {"id": "i8", "value": "f8"}) for row in block.tolist()]
+    found = [tuple(row) for block in read_csv_blocks(path, {"id": "i8", "value": "f8"}) for row in block.tolist()]
     assert found == rows
 
 
