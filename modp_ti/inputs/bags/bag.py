@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import io
 import os
 import re
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 
 from modp_ti.files import open_file, reading
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.bags.unpacking import is_packed, limit_unpacking, unpacked
 
 if TYPE_CHECKING:
     from rosbags.rosbag1 import Reader as Reader1
@@ -41,7 +40,7 @@ STATIC = "tf_static"  # last part of the topic of transforms that hold for all t
 
 # Programs that mend a bag that was cut off, by its suffix.
 MENDS = {".bag": "rosbag reindex", ".mcap": "mcap recover"}
-LARGE = 1 << 16  # reads of more bytes are checked against the size of the file
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
 
 @dataclass(frozen=True)
@@ -116,7 +115,6 @@ class Bag:
         from rosbags.rosbag2 import Reader as Reader2
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-        limit_unpacking()
         self._lock = Lock()
         self._first = files[0].suffix == ".bag"
         self._types = get_typestore(Stores.ROS1_NOETIC if self._first else Stores.ROS2_HUMBLE)
@@ -133,7 +131,7 @@ class Bag:
                 if file.suffix == ".db3" and set(str(file)) & set("?#%"):
                     raise InputError(f"{file}: SQLite cannot open a path with ?, # or %: rename it (source.path)")
                 with self._damaged(file):
-                    reader = (Reader1 if self._first else Reader2)(_SafePath(file))
+                    reader = (Reader1 if self._first else Reader2)(file)
                     try:
                         reader.open()
                     except Exception:
@@ -211,7 +209,7 @@ class Bag:
         kind = self.topics[topic]
         if self._first:
             return self._types.deserialize_ros1(raw, kind)
-        return self._types.deserialize_cdr(unpacked(raw) if is_packed(raw) else raw, kind)
+        return self._types.deserialize_cdr(_unpacked(raw), kind)
 
     @contextmanager
     def _damaged(self, file: Path) -> Iterator[None]:
@@ -221,18 +219,12 @@ class Bag:
             yield
 
 
-class _SafePath(type(Path())):
-    """A path that opens as a file of which no more is asked for than it holds."""
-
-    def open(self, *_: Any, **__: Any) -> Any:
-        return _SafeFile(open_file(self).detach())  # pyright: ignore[reportAttributeAccessIssue]  # it is buffered
-
-
-class _SafeFile(io.BufferedReader):
-    def read(self, size: int | None = -1, /) -> bytes:
-        if size is None or size < 0 or size > LARGE:
-            here = self.tell()
-            left = max(0, self.seek(0, io.SEEK_END) - here)
-            self.seek(here)
-            size = left if size is None or size < 0 else min(size, left)
-        return super().read(size)
+def _unpacked(raw: bytes) -> bytes:
+    """Unpack a message of ROS 2 that is packed. Those that are not begin with a zero byte."""
+    if not raw.startswith(ZSTD_MAGIC):
+        return raw
+    if sys.version_info >= (3, 14):
+        from compression import zstd
+    else:
+        from backports import zstd
+    return zstd.decompress(raw)

@@ -13,19 +13,21 @@ from numpy.typing import NDArray
 from modp_ti.config.camera_settings import BagImagesSettings
 from modp_ti.files.errors import InputError, UnreadableImageError
 from modp_ti.inputs.bags.bag import IMAGES, INFO, Bag, Place
-from modp_ti.inputs.bags.camera_info import camera_of_info, info_beside, is_rectified
-from modp_ti.inputs.bags.frame_tree import clean, seconds
-from modp_ti.inputs.bags.pictures import (
+from modp_ti.inputs.bags.messages import (
     begins_video,
+    camera_of_info,
+    info_beside,
     is_compressed,
     is_deep,
     is_depth,
     is_grey,
+    is_rectified,
     picture,
     picture_size,
     stored_values,
     video_codec,
 )
+from modp_ti.inputs.bags.transforms import clean, seconds
 from modp_ti.inputs.sources.image_pixels import DEPTHS, used_bits
 from modp_ti.inputs.sources.intrinsics import Intrinsics
 from modp_ti.inputs.sources.protocol import ImageSource

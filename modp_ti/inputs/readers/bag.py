@@ -14,10 +14,8 @@ from fields.geometry.se3 import inverse_poses
 from modp_ti.files.errors import InputError
 from modp_ti.files.file_tree import FileTree
 from modp_ti.inputs.bags.bag import CLOUD, POSES, SUFFIXES, has_poses, is_bag
-from modp_ti.inputs.bags.clouds import world_points
-from modp_ti.inputs.bags.depth_images import DepthTopic, depth_topics, read_depth_topic, with_depth_points
-from modp_ti.inputs.bags.frame_tree import FrameTree, clean, read_frame_tree
-from modp_ti.inputs.bags.pose_topics import read_pose_topic
+from modp_ti.inputs.bags.points import DepthTopic, depth_topics, read_depth_topic, with_depth_points, world_points
+from modp_ti.inputs.bags.transforms import FrameTree, clean, read_frame_tree, read_pose_topic
 from modp_ti.inputs.given_poses import posed_images, selected_frames, solving
 from modp_ti.inputs.multiview.triangulation import adjusted_frames, triangulated_frames
 from modp_ti.inputs.opening import open_source

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.bags.depth_images import depth_metres
+from modp_ti.inputs.bags.messages import depth_metres
 from tests.bags import START, STEP, Messages, recording, write_bag
 
 MAKE = Messages()

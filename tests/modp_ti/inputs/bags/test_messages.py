@@ -8,11 +8,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.bags.camera_info import camera_of_info
-from modp_ti.inputs.bags.clouds import cloud_points
-from modp_ti.inputs.bags.frame_tree import FrameTree
-from modp_ti.inputs.bags.motion import Motion
-from modp_ti.inputs.bags.pictures import picture, picture_size
+from modp_ti.inputs.bags.messages import camera_of_info, cloud_points, picture, picture_size
+from modp_ti.inputs.bags.transforms import FrameTree, Motion
 from tests.bags import START, Messages
 
 MAKE, MAKE_ROS1 = Messages(), Messages("ros1")

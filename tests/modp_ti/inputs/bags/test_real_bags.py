@@ -7,8 +7,7 @@ import pytest
 
 from modp_ti.inputs.bags import Bag, has_poses, is_bag
 from modp_ti.inputs.bags.bag import CLOUD, IMAGES, INFO
-from modp_ti.inputs.bags.frame_tree import read_frame_tree
-from modp_ti.inputs.bags.pose_topics import read_pose_topic
+from modp_ti.inputs.bags.transforms import read_frame_tree, read_pose_topic
 from tests.bags import OPTICAL
 
 pytestmark = pytest.mark.real_data

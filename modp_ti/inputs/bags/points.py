@@ -1,8 +1,7 @@
-"""Depth images of a bag, and the tracked points that are taken from them."""
+"""The tracked points of a bag: of its clouds, or of its depth images."""
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -10,29 +9,79 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fields.frames.tracked_frame import IDS_PER_FRAME, SparsePoints
+from fields.frames.tracked_frame import IDS_PER_FRAME
 from modp_ti.files.errors import FEW, InputError
 from modp_ti.inputs.bags.bag import IMAGES, INFO, Bag, Place
-from modp_ti.inputs.bags.camera_info import camera_of_info, info_beside, is_rectified
-from modp_ti.inputs.bags.frame_tree import clean, seconds
-from modp_ti.inputs.bags.pictures import is_compressed, is_depth, picture_size, stored_values
+from modp_ti.inputs.bags.messages import (
+    camera_of_info,
+    cloud_points,
+    depth_metres,
+    info_beside,
+    is_compressed,
+    is_depth,
+    is_rectified,
+    picture_size,
+)
+from modp_ti.inputs.bags.transforms import FrameTree, clean, seconds
 from modp_ti.inputs.capture import DepthMap
 from modp_ti.inputs.depth_maps import sampled_points
+from modp_ti.inputs.point_cloud import projected_points
 from modp_ti.inputs.protocol import Progress
-from modp_ti.inputs.replay import PosedImage, points_inside
-from modp_ti.inputs.sources.image_header import why_undecodable
-from modp_ti.inputs.sources.image_pixels import decoded_as
+from modp_ti.inputs.replay import PosedImage
 from modp_ti.inputs.sources.intrinsics import Intrinsics
 
 if TYPE_CHECKING:
     from modp_ti.inputs.readers.bag import BagSettings
 
+MOST_CLOUD_POINTS = 500_000
 # A depth image belongs to an image that was taken at most so long before or after it [s].
 LARGEST_DELAY = 0.05
 # Largest number of points of a frame. No two frames have one in common, so that more say little of the others.
 MOST = 400
-# Before the PNG of a compressed depth image: its format, and two parameters of inverse depths.
-HEADER = struct.Struct("<iff")
+
+
+def world_points(bag: Bag, topic: str, tree: FrameTree, world: str, max_gap: float) -> NDArray[np.float64]:
+    """Return the points (N, 3) of all clouds of a topic in the world. Points that repeat exactly are given once.
+
+    Of more than `MOST_CLOUD_POINTS`, every n-th one of each cloud is taken.
+
+    Args:
+        bag: The bag.
+        topic: The topic.
+        tree: The transforms by which clouds are moved. Those of times at which they are not known are left out.
+        world: Name of the frame of the points.
+        max_gap: See `Motion.at`.
+
+    Raises:
+        InputError: If a cloud is damaged, or none can be moved to the world.
+    """
+    clouds: list[NDArray[np.float64]] = []
+    frame, stride, count = "", 1, 0
+    for _, message in bag.messages(topic):
+        frame = clean(message.header.frame_id)
+        T = tree.at(world, frame, np.array([seconds(message.header.stamp)]), max_gap)
+        if T is None or not np.isfinite(T).all():
+            continue
+        try:
+            xyz = cloud_points(message)
+        except ValueError as error:
+            raise InputError(f"{bag.path}: a cloud of {topic} is damaged: {error} (tracker.points)") from None
+        if frame != world:
+            xyz = xyz @ T[0, :3, :3].T + T[0, :3, 3]
+        clouds.append(xyz[::stride])
+        count += len(clouds[-1])
+        while count > MOST_CLOUD_POINTS:
+            clouds, stride = [cloud[::2] for cloud in clouds], 2 * stride
+            count = sum(map(len, clouds))
+    if not count:
+        raise InputError(
+            f"{bag.path}: no cloud of {topic} has points that can be moved from {frame!r} to {world!r} at its time "
+            "(tracker.points)"
+        )
+    points = np.concatenate(clouds)
+    if len(clouds) > 1:
+        points = points[np.sort(np.unique(points, axis=0, return_index=True)[1])]
+    return points
 
 
 @dataclass(frozen=True)
@@ -95,31 +144,6 @@ def _is_of(info: Any, frame: str, size: tuple[int, int] | None) -> bool:
     return clean(info.header.frame_id) == frame and size in (None, (info.width, info.height))
 
 
-def depth_metres(message: Any) -> NDArray[np.float32]:
-    """Return the depths (H, W) [m] of an image message; 0 or NaN where they are unknown.
-
-    Raises:
-        ValueError: If it is damaged, or holds no depths.
-    """
-    if not is_compressed(message):
-        if message.encoding == "32FC1":
-            return stored_values(message, "f4")
-        return np.divide(stored_values(message, "u2"), 1000.0, dtype=np.float32)
-    import cv2
-
-    data = message.data.tobytes()
-    head, png = data[: HEADER.size], data[HEADER.size :]
-    reason = "it is cut off" if not png else why_undecodable(png)
-    stored = None if reason is not None else decoded_as(png, cv2.IMREAD_UNCHANGED)
-    if stored is None or stored.ndim != 2 or stored.dtype != np.uint16:
-        raise ValueError(reason or "it holds no grey picture of 16 bits")
-    if not message.format.startswith("32FC1"):
-        return np.divide(stored, 1000.0, dtype=np.float32)
-    _, scale, offset = HEADER.unpack(head)
-    with np.errstate(all="ignore"):  # parameters of a damaged message
-        return np.where(stored > 0, np.float32(scale) / (stored.astype(np.float32) - np.float32(offset)), np.float32(0))
-
-
 def with_depth_points(
     bag: Bag,
     topic: DepthTopic,
@@ -160,7 +184,9 @@ def with_depth_points(
             continue
         depth = DepthMap(metres, metres > 0)
         in_sensor, _ = sampled_points(depth, undistorter, index, min(tracker.max_points, MOST), tracker.max_depth)
-        result[index] = frame.with_points(_seen(in_sensor @ T[:3, :3].T + T[:3, 3], frame, index))
+        xyz = in_sensor @ T[:3, :3].T + T[:3, 3]
+        ids = index * IDS_PER_FRAME + np.arange(len(xyz), dtype=np.int64)
+        result[index] = frame.with_points(projected_points(xyz, ids, frame.undistorter, frame.T_camera_world))
         if progress is not None:
             progress("reading depths", index + 1, len(frames))
     if len(damaged) > FEW * len(frames):
@@ -172,12 +198,3 @@ def with_depth_points(
         )
     bad = f"; {len(damaged)} are damaged and left out (the first: {damaged[0]})" if damaged else ""
     return result, f"{bag.path}: points of the depth images of {topic.name} for {used} of {len(frames)} images{bad}"
-
-
-def _seen(xyz: NDArray[np.float64], frame: PosedImage, index: int) -> SparsePoints:
-    """Return the points that lie inside the image. No two frames have one in common."""
-    in_camera = xyz @ frame.T_camera_world[:3, :3].T + frame.T_camera_world[:3, 3]
-    before = in_camera[:, 2] > 0
-    pixels = frame.undistorter.camera.project(in_camera[before])
-    ids = index * IDS_PER_FRAME + np.arange(len(pixels), dtype=np.int64)
-    return points_inside(xyz[before], pixels, ids, frame.undistorter, frame.T_camera_world)
