@@ -15,11 +15,9 @@ from modp_ti.config.settings import SourceSettings
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.bags import has_poses, is_bag
 from modp_ti.inputs.bare_recording import recorded_scene
-from modp_ti.inputs.inspection.geometry import judge_geometry, measure_geometry
-from modp_ti.inputs.inspection.survey import survey
 from modp_ti.inputs.opening import open_source
 from modp_ti.inputs.readers import bag as bag_tracker
-from tests.bags import BODY_CAMERA, FORMS, OPTICAL, START, STEP, Messages, recording, write_bag
+from tests.bags import BODY_CAMERA, FORMS, START, STEP, Messages, recording, write_bag
 
 PLANE = np.stack(np.meshgrid(np.linspace(-3, 3, 40), np.linspace(-3, 3, 40), [0.0]), axis=-1).reshape(-1, 3)
 
@@ -174,27 +172,6 @@ def test_topics_are_chosen_by_name(views, tmp_path, opened, untriangulated):
             opened(path, **wrong)
 
 
-@pytest.mark.parametrize("wrong", ["link", "inverse"])
-def test_a_wrong_convention_is_found_by_check(wrong, views, tmp_path, opened, untriangulated):
-    """Poses of the camera's body instead of its optical frame, and poses the wrong way round."""
-    views = views[:4]
-    if wrong == "inverse":
-        inverted = [replace(view, T_world_camera=np.linalg.inv(view.T_world_camera)) for view in views]
-        path, camera = write_bag(tmp_path / "room", "mcap", recording(inverted)), None
-    else:
-        path, camera = write_bag(tmp_path / "room", "mcap", recording(views)), "link"
-    geometry = measure_geometry(survey(opened(path, camera=camera), 4, lambda _: None))
-    finding = next(iter(judge_geometry(geometry)))
-    assert finding.code == ("body_axes" if wrong == "link" else "inverse_poses")
-    right = measure_geometry(survey(opened(write_bag(tmp_path / "right", "mcap", recording(views))), 4, lambda _: None))
-    assert not [finding for finding in judge_geometry(right) if finding.code in ("body_axes", "inverse_poses")]
-
-
-def test_the_optical_frame_is_the_body_turned():
-    np.testing.assert_allclose(OPTICAL[:3, 2], [1, 0, 0])  # it looks ahead
-    np.testing.assert_allclose(OPTICAL[:3, 1], [0, 0, -1])  # y down
-
-
 def test_images_of_12_bits_in_16_are_as_bright_as_those_of_8(views, tmp_path, opened, untriangulated):
     deep = [each for each in recording(views[:2]) if each[0] != "/camera/image_raw"]
     for n, view in enumerate(views[:2]):
@@ -279,22 +256,6 @@ def test_a_folder_that_holds_only_a_bag_is_one(form, views, tmp_path):
     path = write_bag(tmp_path / "room", form, recording(views[:1], form))
     (path / "metadata.yaml").unlink()
     assert recorded_scene(path).tracker.kind == "bag"
-
-
-def test_bags_of_several_recordings_are_not_joined(views, tmp_path):
-    for name in ("monday.bag", "tuesday_1.bag"):
-        write_bag(tmp_path / "week" / name, "ros1", recording(views[:1], "ros1"))
-    with pytest.raises(InputError, match=r"monday\.bag, tuesday_1\.bag"):
-        recorded_scene(tmp_path / "week")
-
-
-def test_a_bag_that_was_cut_off_names_what_mends_it(views, tmp_path):
-    path = write_bag(tmp_path / "room", "mcap", recording(views[:3]))
-    (file,) = path.glob("*.mcap")
-    file.write_bytes(file.read_bytes()[:-200])
-    with pytest.raises(InputError, match="mcap recover") as caught:
-        recorded_scene(file)
-    assert "\n" not in str(caught.value)
 
 
 def test_the_camera_of_realsense_viewer_lies_one_folder_aside(views, tmp_path):

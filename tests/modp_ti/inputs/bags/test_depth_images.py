@@ -98,25 +98,9 @@ def test_depths_of_a_sensor_beside_the_camera_are_moved_to_it(views, tmp_path, o
     assert_on_the_plane(opened(write_bag(tmp_path / "room", "mcap", messages), {"scale": 1}), len(views))
 
 
-def test_points_that_are_asked_for_come_before_depths(views, tmp_path, opened):
-    path = write_bag(tmp_path / "room", "mcap", with_depths(views))
-    for asked in ({"points": "none"}, {"depth": "none"}):
-        assert "depth images" not in " ".join(opened(path, {"scale": 1}, **asked).notes)
-
-
 def test_depths_of_other_times_are_not_used_unless_they_are_asked_for(views, tmp_path, opened):
     path = write_bag(tmp_path / "room", "mcap", with_depths(views, delay=20 * STEP))
     tracker = opened(path, {"scale": 1})
     assert "within 0.05 s of it: depth images are not used" in " ".join(tracker.notes)
     with pytest.raises(InputError, match=r"no image sees a depth of /depth/image"):
         opened(path, {"scale": 1}, depth="/depth/image")
-
-
-def test_a_topic_without_depths_or_camera_is_refused(views, tmp_path, opened):
-    messages = with_depths(views)
-    messages.append(("/other/image", START, MAKE.image(START, np.ones((9, 9), "<u2"), "16UC1", "elsewhere")))
-    path = write_bag(tmp_path / "room", "mcap", messages)
-    with pytest.raises(InputError, match=r"no depth images at /odom; there is /depth/image, /other/image"):
-        opened(path, {"scale": 1}, depth="/odom")
-    with pytest.raises(InputError, match="no CameraInfo belongs to the depth images of /other/image"):
-        opened(path, {"scale": 1}, depth="/other/image")

@@ -5,25 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from modp_ti.inputs.bags import Bag, has_poses, is_bag
+from modp_ti.inputs.bags import Bag
 from modp_ti.inputs.bags.bag import CLOUD, IMAGES, INFO
 from modp_ti.inputs.bags.transforms import read_frame_tree, read_pose_topic
 from tests.bags import OPTICAL
 
 pytestmark = pytest.mark.real_data
-
-
-TOPICS = {"example-bz2.bag": 9, "example-lz4.bag": 9, "tf_example.bag": 2, "tf_example": 2, "nav2_turtlebot.mcap": 4}
-
-
-@pytest.mark.parametrize(("name", "count"), TOPICS.items())
-def test_recorded_bags_of_every_form_have_their_topics_and_transforms(name, count, shared_data):
-    path = shared_data("captures") / "rosbag" / name
-    assert is_bag(path) and has_poses(path)
-    bag = Bag(path)
-    tree = read_frame_tree(bag)
-    assert len(bag.topics) == count and tree.moves and len(tree.frames) > 2
-    bag.close()
 
 
 def test_the_odometry_of_a_robot_is_its_transform_from_odom(shared_data):
