@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fields.frames.pose_correction import PoseCorrection
+from fields.frames.pose_correction import CameraRevision, PoseCorrection
 from fields.frames.tracked_frame import SparsePoints
-from fields.geometry.se3 import inverse_se3
 from modp_ti.inputs.klt.landmark_map import Keyframe
+from modp_ti.inputs.klt.recognition import turn_and_shift
 from modp_ti.inputs.klt.tracking import Tracking, View
 from modp_ti.inputs.multiview.reprojection import ray_errors
-from modp_ti.inputs.replay import points_inside
+from modp_ti.inputs.replay import PosedImage, points_inside
 from modp_ti.inputs.sources import Undistorter
 
 MAX_ERROR = 2.5  # points with a larger reprojection error [px of the tracked image] are not delivered
@@ -25,14 +25,8 @@ MOVED = 0.2
 
 
 @dataclass
-class DeliveredFrame:
-    """A frame with its last delivered pose.
-
-    Attributes:
-        name: Name of its image.
-        view: Its pose relative to a keyframe, and its landmarks.
-        T_camera_world: (4, 4) the delivered pose.
-    """
+class _Delivered:
+    """A delivered frame: the name of its image, its view, and T_camera_world (4, 4) as it was delivered."""
 
     name: str
     view: View
@@ -51,35 +45,30 @@ class DeliveredTrajectory:
     """
 
     def __init__(self, tracking: Tracking, undistorter: Undistorter) -> None:
-        self.frames: list[DeliveredFrame] = []
+        self.frames: list[_Delivered] = []
         self._tracking = tracking
-        self._map = tracking.map
         self._undistorter = undistorter
-        # By number of the frame: the keyframes of delivered frames, with their delivered poses.
-        self._keyframes: dict[int, tuple[Keyframe, NDArray[np.float64]]] = {}
+        # By number: the keyframes of delivered frames, with their delivered poses.
+        self._keyframes: dict[int, NDArray[np.float64]] = {}
         self._keyframes_checked = len(tracking.map.keyframes)
         self._xyz = np.zeros((0, 3))
         self._remembered = 0  # the first frame that still has its landmarks
 
-    def add(self, name: str, view: View) -> DeliveredFrame:
-        """Add the next frame."""
-        frame = DeliveredFrame(name, view, self._tracking.pose(view))
-        self.frames.append(frame)
-        keyframe = view.keyframe
-        self._keyframes.setdefault(keyframe.number, (keyframe, keyframe.T_camera_world.copy()))
-        return frame
-
-    def points(self, frame: DeliveredFrame) -> SparsePoints:
-        """Landmarks of a frame whose reprojection error is small, in pixels of the delivered image."""
-        ids, lens, camera = frame.view.ids, self._map.lens, self._undistorter.camera
-        xyz, rays = self._map.xyz[ids], lens.rays(frame.view.pixels)
-        good = self._map.known[ids] & (ray_errors(frame.T_camera_world, xyz, rays) * lens.focal < MAX_ERROR)
+    def add(self, name: str, view: View) -> PosedImage:
+        """Add the next frame. Returns it with the landmarks whose reprojection error is small."""
+        landmarks, camera, T = self._tracking.map, self._undistorter.camera, self._tracking.pose(view)
+        self.frames.append(_Delivered(name, view, T))
+        if view.keyframe not in self._keyframes:
+            self._remember([view.keyframe])
+        xyz, rays = landmarks.xyz[view.ids], landmarks.lens.rays(view.pixels)
+        good = landmarks.known[view.ids] & (ray_errors(T, xyz, rays) * landmarks.lens.focal < MAX_ERROR)
         pixels = rays[good] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
-        return points_inside(xyz[good], pixels, ids[good], self._undistorter, frame.T_camera_world)
+        points = points_inside(xyz[good], pixels, view.ids[good], self._undistorter, T)
+        return PosedImage(name, self._undistorter, T, points)
 
     def record(self, points: SparsePoints) -> None:
         """Record points that were delivered. Only the first position of each is kept until it is corrected."""
-        fresh = max(0, len(self._map.known) - len(self._xyz))
+        fresh = max(0, len(self._tracking.map.known) - len(self._xyz))
         self._xyz = np.concatenate([self._xyz, np.full((fresh, 3), np.nan)])
         new = np.isnan(self._xyz[points.ids, 0])
         self._xyz[points.ids[new]] = points.xyz[new]
@@ -87,7 +76,7 @@ class DeliveredTrajectory:
     def forget_points(self) -> None:
         """Forget the landmarks of all frames, once the camera is final. Poses are still corrected."""
         for frame in self.frames[self._remembered :]:
-            frame.view = replace(frame.view, ids=frame.view.ids[:0].copy(), pixels=frame.view.pixels[:0].copy())
+            frame.view.forget_landmarks()
         self._remembered = len(self.frames)
 
     def corrections(self, last: bool = False) -> Iterator[PoseCorrection]:
@@ -98,29 +87,19 @@ class DeliveredTrajectory:
         Args:
             last: There are no more frames: small motions are corrected too.
         """
-        landmarks = self._map
+        landmarks = self._tracking.map
         if not last and len(landmarks.keyframes) == self._keyframes_checked:
             return
         self._keyframes_checked = len(landmarks.keyframes)
-        moved = {number: self._shift(*each) for number, each in self._keyframes.items()}
+        moved = {number: self._shift(number) for number in self._keyframes}
         if max(moved.values()) < (MOVED if last else NOTABLE):
             return
         affected = {number for number, shift in moved.items() if shift >= MOVED}
-        index = [i for i, frame in enumerate(self.frames) if frame.view.keyframe.number in affected]
-        for i in index:
-            self.frames[i].T_camera_world = self._tracking.pose(self.frames[i].view)
-        self._remember(affected)
-        known = np.flatnonzero(~np.isnan(self._xyz[:, 0]) & landmarks.known[: len(self._xyz)])
+        index = [i for i, frame in enumerate(self.frames) if frame.view.keyframe in affected]
+        known = self._known()
         away = np.linalg.norm(landmarks.xyz[known] - self._xyz[known], axis=1)
-        ids = known[away > MOVED * self._depth(self._keyframes[max(affected)][0]) / landmarks.lens.focal]
-        self._xyz[ids] = landmarks.xyz[ids]
-        yield PoseCorrection(
-            index=np.array(index, dtype=np.int64),
-            T_camera_world=np.stack([self.frames[i].T_camera_world for i in index]),
-            ids=ids.astype(np.int64),
-            xyz=landmarks.xyz[ids].copy(),
-            others_stay=True,
-        )
+        ids = known[away > MOVED * self._depth(self._keyframe(max(affected))) / landmarks.lens.focal]
+        yield self._corrected(index, affected, ids)
 
     def revise_camera(self, undistorter: Undistorter) -> PoseCorrection:
         """Return the correction of all frames and points, after the map has got another camera.
@@ -131,35 +110,44 @@ class DeliveredTrajectory:
         revision, self._undistorter = undistorter.revising(self._undistorter), undistorter
         for frame in self.frames:
             self._tracking.relocalise(frame.view)
-            frame.T_camera_world = self._tracking.pose(frame.view)
-        self._remember(list(self._keyframes))
-        ids = np.flatnonzero(~np.isnan(self._xyz[:, 0]) & self._map.known[: len(self._xyz)])
-        self._xyz[ids] = self._map.xyz[ids]
-        return PoseCorrection(
-            index=np.arange(len(self.frames)),
-            T_camera_world=np.stack([frame.T_camera_world for frame in self.frames]),
-            ids=ids,
-            xyz=self._map.xyz[ids].copy(),
-            camera=revision,
-        )
+        return self._corrected(range(len(self.frames)), list(self._keyframes), self._known(), revision)
+
+    def _corrected(
+        self,
+        index: Iterable[int],
+        keyframes: Iterable[int],
+        ids: NDArray[np.int64],
+        camera: CameraRevision | None = None,
+    ) -> PoseCorrection:
+        """The correction of the frames of `index`, whose keyframes are given, and of landmarks (N,)."""
+        for i in index:
+            self.frames[i].T_camera_world = self._tracking.pose(self.frames[i].view)
+        self._remember(keyframes)
+        xyz = self._xyz[ids] = self._tracking.map.xyz[ids]
+        poses = np.stack([self.frames[i].T_camera_world for i in index])
+        return PoseCorrection(np.array(index, dtype=np.int64), poses, ids, xyz, camera, camera is None)
+
+    def _known(self) -> NDArray[np.int64]:
+        """Ids of the landmarks that were delivered and still have a position."""
+        return np.flatnonzero(~np.isnan(self._xyz[:, 0]) & self._tracking.map.known[: len(self._xyz)])
+
+    def _keyframe(self, number: int) -> Keyframe:
+        return self._tracking.map.keyframes[self._tracking.map.index(number)]
 
     def _remember(self, numbers: Iterable[int]) -> None:
         """Record that the poses of these keyframes were delivered."""
-        for number in numbers:
-            keyframe = self._keyframes[number][0]
-            self._keyframes[number] = keyframe, keyframe.T_camera_world.copy()
+        self._keyframes |= {number: self._keyframe(number).T_camera_world.copy() for number in numbers}
 
     def _depth(self, keyframe: Keyframe) -> float:
         """Median depth of the landmarks that a keyframe sees."""
-        ids = keyframe.ids[self._map.known[keyframe.ids]]
-        T = keyframe.T_camera_world
-        return float(np.median(self._map.xyz[ids] @ T[2, :3] + T[2, 3])) if len(ids) else 1.0
+        landmarks, T = self._tracking.map, keyframe.T_camera_world
+        ids = keyframe.ids[landmarks.known[keyframe.ids]]
+        return float(np.median(landmarks.xyz[ids] @ T[2, :3] + T[2, 3])) if len(ids) else 1.0
 
-    def _shift(self, keyframe: Keyframe, delivered: NDArray[np.float64]) -> float:
+    def _shift(self, number: int) -> float:
         """Approximate image motion [px of the tracked image] of a keyframe since its pose was last delivered."""
+        keyframe, delivered = self._keyframe(number), self._keyframes[number]
         if np.array_equal(keyframe.T_camera_world, delivered):
             return 0.0
-        change = keyframe.T_camera_world @ inverse_se3(delivered)
-        turn = float(np.arccos(np.clip((np.trace(change[:3, :3]) - 1.0) / 2.0, -1.0, 1.0)))
-        away = float(np.linalg.norm(change[:3, 3])) / max(self._depth(keyframe), 1e-12)
-        return (turn + away) * self._map.lens.focal
+        turn, away = turn_and_shift(keyframe.T_camera_world, delivered)
+        return (turn + away / max(self._depth(keyframe), 1e-12)) * self._tracking.map.lens.focal

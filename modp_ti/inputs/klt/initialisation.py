@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,21 +22,23 @@ LONGEST = 400  # frames in memory
 MAX_ERROR = 1.5  # px, RANSAC threshold
 FEWEST_PLACED = 40  # points with parallax
 
+TwoViews = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]
+
 
 class Initialisation:
     """Collects frames until `add` returns a map.
 
     Args:
-        lenses: Candidate cameras. The map gets the one with the lowest cost.
+        lens: The camera.
         seed: Seed of RANSAC.
 
     Attributes:
         frames: The last LONGEST frames.
     """
 
-    def __init__(self, lenses: Sequence[Lens], seed: int) -> None:
+    def __init__(self, lens: Lens, seed: int) -> None:
         self.frames: list[Frame] = []
-        self._lenses = list(lenses)
+        self._lens = lens
         self._seed = seed
         self._count = 0
 
@@ -56,24 +55,18 @@ class Initialisation:
         if self.frames:
             last = self.frames[-1]
             frame.track(last)
-            if len(frame.ids) < max(FEWEST_SHARED, 0.35 * len(last.ids)) <= len(last.ids):
-                self._match(last, frame)
-        self.frames.append(frame)
-        if len(self.frames) > LONGEST:
-            del self.frames[0]
+            if len(frame.ids) < max(FEWEST_SHARED, 0.35 * len(last.ids)) <= len(last.ids):  # flow has lost too many
+                a, b = last.described, frame.described
+                pairs = match_anywhere(a, b).pairs
+                ids = self._new_ids(len(pairs))
+                last.append(ids, a.pixels[pairs[:, 0]])
+                frame.append(ids, b.pixels[pairs[:, 1]])
+        self.frames = [*self.frames, frame][-LONGEST:]
         found = self._attempt(frame) if attempts else None
         if len(frame.ids) < 0.75 * WANTED:
             new = frame.new_corners()
             frame.append(self._new_ids(len(new)), new)
         return found
-
-    def _match(self, last: Frame, frame: Frame) -> None:
-        """Add SIFT matches with the frame before to both frames, where flow has lost too many features."""
-        a, b = last.described, frame.described
-        pairs = match_anywhere(a, b).pairs
-        ids = self._new_ids(len(pairs))
-        last.append(ids, a.pixels[pairs[:, 0]])
-        frame.append(ids, b.pixels[pairs[:, 1]])
 
     def _new_ids(self, count: int) -> NDArray[np.int64]:
         self._count += count
@@ -84,17 +77,9 @@ class Initialisation:
         if first is None:
             return None
         share, a, b = np.intersect1d(self.frames[first].ids, frame.ids, return_indices=True)
-        pixels_a, pixels_b = self.frames[first].pixels[a], frame.pixels[b]
         least = LEAST_ANGLE if len(self.frames) < PATIENCE else 0.5 * LEAST_ANGLE
-        best, best_cost = None, np.inf
-        for lens in self._lenses:
-            pair = two_views(lens, pixels_a, pixels_b, least, self._seed)
-            if pair is None:
-                continue
-            landmarks, cost = self._mapped(lens, first, share, pair)
-            if landmarks is not None and cost < best_cost:
-                best, best_cost = landmarks, cost
-        return best
+        pair = two_views(self._lens, self.frames[first].pixels[a], frame.pixels[b], least, self._seed)
+        return None if pair is None else self._mapped(first, share, pair)
 
     def _partner(self, frame: Frame) -> int | None:
         """Index of the frame with the largest motion to this one, among those that share enough features with it."""
@@ -111,76 +96,46 @@ class Initialisation:
                 best, best_shift = i, shift
         return best
 
-    def _mapped(
-        self, lens: Lens, first: int, share: NDArray[np.int64], pair: TwoViews
-    ) -> tuple[LandmarkMap | None, float]:
-        """Build the map of a pair and of frames between, with its cost; None if it is inconsistent."""
-        landmarks = LandmarkMap(lens)
+    def _mapped(self, first: int, share: NDArray[np.int64], pair: TwoViews) -> LandmarkMap | None:
+        """Build the map of a pair and of frames between; None if it is inconsistent."""
+        lens, landmarks = self._lens, LandmarkMap(self._lens)
         landmarks.new_ids(self._count)
-        ids, xyz = share[pair.good], pair.xyz[pair.good]
+        T_last, xyz, good = pair
+        ids, xyz = share[good], xyz[good]
         scale = 1.0 / float(np.median(xyz[:, 2]))  # the median depth becomes 1
         landmarks.xyz[ids] = scale * xyz
         landmarks.known[ids] = True
-        T_last = pair.T_b_a.copy()
         T_last[:3, 3] *= scale
         last = len(self.frames) - 1
-        middle = np.unique(np.linspace(first, last, BETWEEN + 2).round().astype(int)[1:-1])
         poses = {first: np.eye(4), last: T_last}
-        for i in middle:
-            other = self.frames[i]
+        for i in np.unique(np.linspace(first, last, BETWEEN + 2).round().astype(int)[1:-1]).tolist():
             if i in poses:
                 continue
+            other = self.frames[i]
             known = landmarks.known[other.ids]
             rays = lens.rays(other.pixels[known])
             found = pose_from_points(landmarks.xyz[other.ids[known]], rays, 3.0 / lens.focal, self._seed)
             if found is not None and found[1].sum() >= max(FEWEST_SHARED // 2, 0.5 * known.sum()):
-                poses[int(i)] = found[0]
+                poses[i] = found[0]
         for i in sorted(poses):
             seen = self.frames[i]
-            pixels = seen.pixels.copy()
-            keyframe = Keyframe(seen.number, poses[i], seen.grey, seen.ids.copy(), pixels, lens.rays(pixels))
-            landmarks.add_keyframe(keyframe)
+            rays = lens.rays(seen.pixels)
+            landmarks.add_keyframe(Keyframe(seen.number, poses[i], seen.grey, seen.ids, seen.pixels, rays))
         every = range(len(poses))
-        for _ in range(2):
-            if not np.isfinite(landmarks.adjust(every, steps=30)):
-                return None, np.inf
+        for steps in (30, 30, 15):
+            if not np.isfinite(landmarks.adjust(every, steps=steps)):
+                return None
             landmarks.discard_outliers(every)
-            for k in every:
+            for k in every if steps == 30 else ():
                 landmarks.triangulate(k)
-        cost = landmarks.adjust(every, steps=15)
-        landmarks.discard_outliers(every)
-        if not self._holds(landmarks, len(share)):
-            return None, np.inf
-        return landmarks, cost
-
-    @staticmethod
-    def _holds(landmarks: LandmarkMap, shared: int) -> bool:
-        """Whether the map keeps enough landmarks and has a median reprojection error below 1 px."""
-        _, ids, _ = landmarks.observations([len(landmarks.keyframes) - 1])
-        if len(ids) < max(FEWEST_SHARED // 2, 0.5 * shared):
-            return False
+        # The map must keep enough landmarks, with a median reprojection error below 1 px.
+        if len(landmarks.observations([every[-1]])[1]) < max(FEWEST_SHARED // 2, 0.5 * len(share)):
+            return None
         errors = []
         for keyframe in landmarks.keyframes:
             known = landmarks.known[keyframe.ids]
             errors.append(ray_errors(keyframe.T_camera_world, landmarks.xyz[keyframe.ids[known]], keyframe.rays[known]))
-        return bool(np.median(np.concatenate(errors)) * landmarks.lens.focal < 1.0)
-
-
-@dataclass(frozen=True)
-class TwoViews:
-    """Relative motion of two views with triangulated points.
-
-    Attributes:
-        T_b_a: (4, 4), with a translation of length 1.
-        xyz: (N, 3) points in the frame of a.
-        good: (N,) mask of the reliable points.
-        planar: Whether the motion comes from a homography.
-    """
-
-    T_b_a: NDArray[np.float64]
-    xyz: NDArray[np.float64]
-    good: NDArray[np.bool_]
-    planar: bool
+        return landmarks if np.median(np.concatenate(errors)) * lens.focal < 1.0 else None
 
 
 def two_views(
@@ -196,7 +151,8 @@ def two_views(
         seed: Seed of RANSAC.
 
     Returns:
-        Motion and points; None if the motion cannot be estimated reliably.
+        T_b_a (4, 4) with a translation of length 1, points (N, 3) in the frame of the first view, and a mask (N,) of
+        the reliable ones; None if the motion cannot be estimated reliably.
     """
     from modp_ti.files.quiet_pycolmap import pycolmap
 
@@ -232,15 +188,7 @@ def two_views(
     )
     if good.sum() < max(FEWEST_PLACED, 0.5 * len(pixels_a)):
         return None
-    if np.degrees(np.median(_angles(T, xyz[good]))) < min_angle:
-        return None
-    return TwoViews(T, xyz, good, found.config == kinds.PLANAR)
-
-
-def _angles(T_b_a: NDArray[np.float64], xyz: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Parallax (N,) of points (N, 3), radians."""
-    centre = -T_b_a[:3, :3].T @ T_b_a[:3, 3]
-    a = xyz / np.linalg.norm(xyz, axis=1, keepdims=True)
-    b = xyz - centre
-    b /= np.linalg.norm(b, axis=1, keepdims=True)
-    return np.arccos(np.clip((a * b).sum(axis=1), -1.0, 1.0))
+    a, b = xyz[good], xyz[good] + T[:3, :3].T @ T[:3, 3]  # from the two cameras
+    a, b = (each / np.linalg.norm(each, axis=1, keepdims=True) for each in (a, b))
+    angle = np.arccos(np.clip((a * b).sum(axis=1), -1.0, 1.0))
+    return (T, xyz, good) if np.degrees(np.median(angle)) >= min_angle else None

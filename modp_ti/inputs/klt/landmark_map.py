@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from fields.geometry.se3 import inverse_se3, moved_points, moved_pose, scale_of
 from modp_ti.inputs.klt.camera import Lens
+from modp_ti.inputs.klt.frame import LocalisedFrame
 from modp_ti.inputs.multiview.bundle_adjustment import Refinable, adjusted_apart, adjusted_bundle
 from modp_ti.inputs.multiview.features import Features
 from modp_ti.inputs.multiview.reprojection import ray_errors
@@ -18,9 +20,17 @@ from modp_ti.inputs.multiview.reprojection import ray_errors
 MAX_ERROR = 2.5
 # Smallest angle [degrees] between the rays of a new landmark. With less parallax its depth is unreliable.
 MIN_ANGLE = 1.2
-# The arrays of the landmarks, and the values of free places that are not 0.
-LANDMARKS = ("xyz", "known", "first", "first_pixel", "last", "last_pixel", "looked", "found")
-EMPTY = {"first": -1, "last": -1}
+# The arrays of the landmarks: shape of an element, type, and value of free places.
+LANDMARKS = {
+    "xyz": ((3,), np.float64, 0),
+    "known": ((), np.bool_, 0),
+    "first": ((), np.int64, -1),
+    "first_pixel": ((2,), np.float64, 0),
+    "last": ((), np.int64, -1),
+    "last_pixel": ((2,), np.float64, 0),
+    "looked": ((), np.int64, 0),
+    "found": ((), np.int64, 0),
+}
 
 
 @dataclass
@@ -63,11 +73,9 @@ class Keyframe:
         """Remove all observations except those of the mask (N,)."""
         self.ids, self.pixels, self.rays = self.ids[kept], self.pixels[kept], self.rays[kept]
 
-    def append(self, ids: NDArray[np.int64], pixels: NDArray[np.float64], rays: NDArray[np.float64]) -> None:
-        """Add observations (M,) with their pixels (M, 2) and normalised coordinates (M, 2)."""
-        self.ids = np.concatenate([self.ids, ids])
-        self.pixels = np.concatenate([self.pixels, pixels])
-        self.rays = np.concatenate([self.rays, rays])
+    def frame(self, valid: NDArray[np.bool_] | None = None) -> LocalisedFrame:
+        """Its frame, which shares its pose; features may be tracked in `valid` (H, W), None for everywhere."""
+        return LocalisedFrame(self.number, self.grey, valid, self.ids, self.pixels, T_camera_world=self.T_camera_world)
 
 
 class LandmarkMap:
@@ -91,19 +99,21 @@ class LandmarkMap:
         unsolved: Number of adjustments for which Ceres found no usable solution.
     """
 
+    xyz: NDArray[np.float64]
+    known: NDArray[np.bool_]
+    first: NDArray[np.int64]
+    first_pixel: NDArray[np.float64]
+    last: NDArray[np.int64]
+    last_pixel: NDArray[np.float64]
+    looked: NDArray[np.int64]
+    found: NDArray[np.int64]
+
     def __init__(self, lens: Lens) -> None:
         self.lens = lens
         self.keyframes: list[Keyframe] = []
-        self.unsolved = 0
-        self.count = 0
-        self.xyz = np.zeros((0, 3))
-        self.known = np.zeros(0, dtype=bool)
-        self.first = np.zeros(0, dtype=np.int64)
-        self.first_pixel = np.zeros((0, 2))
-        self.last = np.zeros(0, dtype=np.int64)
-        self.last_pixel = np.zeros((0, 2))
-        self.looked = np.zeros(0, dtype=np.int64)
-        self.found = np.zeros(0, dtype=np.int64)
+        self.unsolved = self.count = 0
+        for name, (shape, kind, _) in LANDMARKS.items():
+            setattr(self, name, np.zeros((0, *shape), kind))
 
     def new_ids(self, count: int) -> NDArray[np.int64]:
         """Reserve ids (count,) for new features."""
@@ -111,16 +121,19 @@ class LandmarkMap:
         self.count += count
         if self.count > len(self.known):
             extra = max(self.count, 2 * len(self.known), 1024) - len(self.known)
-            for name in LANDMARKS:
-                array, value = getattr(self, name), EMPTY.get(name, 0)
-                setattr(self, name, np.concatenate([array, np.full((extra, *array.shape[1:]), value, array.dtype)]))
+            for name, (shape, kind, empty) in LANDMARKS.items():
+                setattr(self, name, np.concatenate([getattr(self, name), np.full((extra, *shape), empty, kind)]))
         return ids
+
+    def index(self, number: int) -> int:
+        """Index of the keyframe that is the frame of this number, or else of the last one before; -1 for none."""
+        return bisect_right(self.keyframes, number, key=lambda keyframe: keyframe.number) - 1
 
     def add_keyframe(self, keyframe: Keyframe) -> int:
         """Append a keyframe and return its index."""
         self.keyframes.append(keyframe)
         k = len(self.keyframes) - 1
-        self.note_observations(k, keyframe.ids, keyframe.pixels)
+        self._note_observations(k, keyframe.ids, keyframe.pixels)
         return k
 
     def absorb(self, other: LandmarkMap, S_self_other: NDArray[np.float64]) -> int:
@@ -136,20 +149,15 @@ class LandmarkMap:
         offset, count = self.count, other.count
         self.unsolved += other.unsolved
         ids = self.new_ids(count)
-        mine, others = list(self.keyframes), list(other.keyframes)
+        mine, others = self.keyframes, other.keyframes
         self.keyframes = sorted([*mine, *others], key=lambda keyframe: keyframe.number)
-        place = {keyframe.number: k for k, keyframe in enumerate(self.keyframes)}
         for name in ("known", "looked", "found", "first_pixel", "last_pixel"):
             getattr(self, name)[ids] = getattr(other, name)[:count]
         self.xyz[ids] = moved_points(S_self_other, other.xyz[:count])
-        for name in ("first", "last"):
-            array = getattr(self, name)
-            for rows, keyframes, old in (
-                (np.arange(offset), mine, array[:offset]),
-                (ids, others, getattr(other, name)[:count]),
-            ):
-                now = np.array([place[keyframe.number] for keyframe in keyframes] + [-1], dtype=np.int64)
-                array[rows] = now[old]  # -1, for none, is the last
+        for rows, keyframes, source in ((np.arange(offset), mine, self), (ids, others, other)):
+            now = np.array([self.index(keyframe.number) for keyframe in keyframes] + [-1], dtype=np.int64)
+            for name in ("first", "last"):
+                getattr(self, name)[rows] = now[getattr(source, name)[: len(rows)]]  # -1, for none, is the last
         for keyframe in others:
             keyframe.move(S_self_other)
             keyframe.ids = keyframe.ids + offset
@@ -157,7 +165,15 @@ class LandmarkMap:
             keyframe.rays = self.lens.rays(keyframe.pixels)
         return offset
 
-    def note_observations(self, k: int, ids: NDArray[np.int64], pixels: NDArray[np.float64]) -> None:
+    def observe(self, k: int, ids: NDArray[np.int64], pixels: NDArray[np.float64]) -> None:
+        """Add observations of features (N,) at pixels (N, 2) to keyframe k."""
+        keyframe = self.keyframes[k]
+        keyframe.ids = np.concatenate([keyframe.ids, ids])
+        keyframe.pixels = np.concatenate([keyframe.pixels, pixels])
+        keyframe.rays = np.concatenate([keyframe.rays, self.lens.rays(pixels)])
+        self._note_observations(k, ids, pixels)
+
+    def _note_observations(self, k: int, ids: NDArray[np.int64], pixels: NDArray[np.float64]) -> None:
         """Update the first and last observation of features (N,) that keyframe k sees at pixels (N, 2)."""
         fresh = self.first[ids] < 0
         self.first[ids[fresh]], self.first_pixel[ids[fresh]] = k, pixels[fresh]
@@ -181,12 +197,11 @@ class LandmarkMap:
             of.append(np.full(len(ids[-1]), k))
         return np.concatenate(of), np.concatenate(ids), np.concatenate(pixels)
 
-    def triangulate(self, k: int) -> NDArray[np.int64]:
-        """Triangulate features of keyframe k with their first observation. Returns the ids of the new landmarks."""
+    def triangulate(self, k: int) -> None:
+        """Triangulate features of keyframe k with their first observation."""
         keyframe = self.keyframes[k]
         slots = np.flatnonzero(~self.known[keyframe.ids] & (self.first[keyframe.ids] >= 0))
         slots = slots[self.first[keyframe.ids[slots]] != k]
-        made = []
         for first in np.unique(self.first[keyframe.ids[slots]]):
             other = self.keyframes[first]
             mine = slots[self.first[keyframe.ids[slots]] == first]
@@ -197,12 +212,10 @@ class LandmarkMap:
             )
             self.xyz[ids[good]] = xyz[good]
             self.known[ids[good]] = True
-            made.append(ids[good])
-        return np.concatenate(made) if made else np.zeros(0, dtype=np.int64)
 
     def discard_outliers(self, keyframes: Iterable[int]) -> None:
         """Remove outlier observations of these keyframes, and landmarks that fewer than two keyframes still see."""
-        touched = []
+        touched = [np.zeros(0, dtype=np.int64)]
         for k in keyframes:
             keyframe = self.keyframes[k]
             known = self.known[keyframe.ids]
@@ -211,7 +224,7 @@ class LandmarkMap:
             wrong = error * self.lens.focal > MAX_ERROR
             touched.append(keyframe.ids[wrong])
             keyframe.keep(~wrong)
-        touched = np.unique(np.concatenate(touched)) if touched else np.zeros(0, dtype=np.int64)
+        touched = np.unique(np.concatenate(touched))
         if len(touched) == 0:
             return
         seen = np.zeros(len(self.known), dtype=np.int64)
@@ -224,7 +237,7 @@ class LandmarkMap:
         lost[touched] = True
         for k, keyframe in enumerate(self.keyframes):
             slots = np.flatnonzero(lost[keyframe.ids])
-            self.note_observations(k, keyframe.ids[slots], keyframe.pixels[slots])
+            self._note_observations(k, keyframe.ids[slots], keyframe.pixels[slots])
 
     def adjust(
         self,
@@ -264,7 +277,9 @@ class LandmarkMap:
             self.keyframes[k].T_camera_world[:3] = T[:3]
         self.xyz[bundle.points] = bundle.xyz
         if refined:
-            self._take(Lens(bundle.camera))
+            self.lens = Lens(bundle.camera)
+            for keyframe in self.keyframes:
+                keyframe.rays = self.lens.rays(keyframe.pixels)
         return bundle.cost
 
     def move(self, moves: Sequence[NDArray[np.float64]]) -> None:
@@ -286,26 +301,6 @@ class LandmarkMap:
             for each in self.keyframes
         ]
         return other
-
-    def adopt(self, other: LandmarkMap) -> None:
-        """Become what a copy of this map is, which has the same keyframes and must not be used afterwards."""
-        self.lens, self.count, self.unsolved = other.lens, other.count, other.unsolved
-        for name in LANDMARKS:
-            setattr(self, name, getattr(other, name))
-        for keyframe, now in zip(self.keyframes, other.keyframes, strict=True):
-            keyframe.T_camera_world[:] = now.T_camera_world
-            keyframe.ids, keyframe.pixels, keyframe.rays = now.ids, now.pixels, now.rays
-            keyframe.scale = now.scale
-            if now.described is not None:
-                keyframe.described, keyframe.described_ids = now.described, now.described_ids
-            else:
-                keyframe.described_ids = np.full_like(keyframe.described_ids, -1)
-
-    def _take(self, lens: Lens) -> None:
-        """Replace the camera, and with it the rays of all observations."""
-        self.lens = lens
-        for keyframe in self.keyframes:
-            keyframe.rays = lens.rays(keyframe.pixels)
 
 
 def triangulated(

@@ -11,8 +11,16 @@ from numpy.typing import NDArray
 
 from fields.geometry.se3 import inverse_se3, motion_around, scale_of
 from modp_ti.inputs.klt.landmark_map import LANDMARKS, LandmarkMap
-from modp_ti.inputs.klt.map_connection import connected
-from modp_ti.inputs.klt.recognition import PlaceIndex, Recognition, agreeing, recognised
+from modp_ti.inputs.klt.map_joining import connected
+from modp_ti.inputs.klt.recognition import (
+    AGREEING,
+    PAUSE,
+    PlaceIndex,
+    Recognition,
+    agreeing,
+    recognised,
+    turn_and_shift,
+)
 from modp_ti.inputs.klt.tracking import Tracking
 
 EVERY = 5  # new keyframes that are compared together, at least
@@ -30,24 +38,22 @@ CANDIDATES = 2  # keyframes with which a keyframe is compared
 # Cosine of the image descriptors from which keyframes are compared. It is 0.1 to 0.8 for overlapping pictures of
 # redkitchen, and below 0.07 for others.
 LEAST_LIKENESS = 0.05
-AGREEING = 3  # keyframes that must agree
 REMEMBERED = 12  # keyframes for which a recognition counts
-PAUSE = 5  # keyframes after a loop in which none is sought
 STEPS = 50  # of the pose graph
 # Uncertainties of a link in rotation [radians], place (relative to the scene's depth) and scale. Only their ratios
 # matter.
 SIGMA = 0.01
 
 
+Link = tuple[int, int, NDArray[np.float64]]
+"""Indices a and b of two keyframes, and the similarity T_a_b (4, 4) from the camera frame of b to that of a."""
+
+
 @dataclass(frozen=True)
 class _Search:
-    """A search for a loop that is in progress.
+    """A search for a loop in a copy of a map, which is due at a number of keyframes.
 
-    Attributes:
-        tracking: The tracking whose map is searched.
-        copy: A copy of the map.
-        due: Number of keyframes at which the result is taken.
-        result: The copy after it was adjusted, or None without a loop; and whether a loop was found.
+    Its result is the copy after it was adjusted, or None without a loop; and whether a loop was found.
     """
 
     tracking: Tracking
@@ -62,7 +68,7 @@ class LoopClosing:
     A thread searches a copy of the map. If there is a loop, it adjusts the copy, and the map then moves like that.
 
     Args:
-        seed: Seed of RANSAC.
+        seed: Seed of RANSAC and of the vocabulary.
         waits: Whether the result of a search is taken at a certain keyframe, even if tracking has to wait for it, so
             that results can be reproduced. Otherwise it is taken at the first keyframe at which it is there.
 
@@ -74,11 +80,15 @@ class LoopClosing:
     def __init__(self, seed: int, waits: bool = True) -> None:
         self.closed = self.undone = 0
         self._waits = waits
-        self._detection = LoopDetection(seed)
+        self._seed = seed
         self._thread = ThreadPoolExecutor(1, "loops")
         self._search: _Search | None = None
         self._tracking: Tracking | None = None
         self._since = 0  # the first keyframe that has not been compared
+        # Of the thread alone: the recognitions with the index of their keyframe, and until which none is sought.
+        self._index = PlaceIndex(seed)
+        self._found: list[tuple[int, Recognition]] = []
+        self._pause_until = 0
 
     def at_keyframe(self, tracking: Tracking) -> None:
         """Take the result of a search that is due, and begin the next one. The last frame is a keyframe."""
@@ -90,7 +100,7 @@ class LoopClosing:
             self._take(search, tracking)
         if tracking is not self._tracking:
             self._tracking, self._since = tracking, count - 1
-            self._thread.submit(self._detection.begin_anew)
+            self._thread.submit(self._forget)  # keyframes will have other indices
         if count - max(self._since, YOUNGEST + 1) >= EVERY:
             self._begin(tracking)
 
@@ -113,10 +123,60 @@ class LoopClosing:
         self._search = _Search(tracking, copy, count + EVERY + count // GROWTH, result)
         return self._search
 
+    def _forget(self) -> None:
+        self._found.clear()
+        self._pause_until = 0
+
     def _searched(self, landmarks: LandmarkMap, since: int) -> tuple[LandmarkMap | None, bool]:
-        """What the thread does."""
-        found = self._detection.search(landmarks, since)
-        return (closed_map(landmarks, found), True) if found else (None, False)
+        """What the thread does: close a loop in a copy of the map; None if there is none or the map contradicts it."""
+        found = self._loop(landmarks, since)
+        if not found:
+            return None, False
+        after = landmarks.copy()
+        index, poses = landmarks.index, [keyframe.T_camera_world for keyframe in landmarks.keyframes]
+        links = []
+        for each in found:  # from the camera of `by`, in the scale around it, to that of `of`
+            s = float(scale_of(each.S_of_by))
+            T_of_by = each.of.T_camera_world @ inverse_se3(each.T_camera_world) @ np.diag([s, s, s, 1.0])
+            links.append((index(each.of.number), index(each.by.number), T_of_by))
+        depth = float(np.median([each.depth for each in found]))
+        after.move(closed_loop(poses, connected_keyframes(landmarks), links, depth))
+        return after if connected(after, found, apart=True) else None, True
+
+    def _loop(self, landmarks: LandmarkMap, since: int) -> list[Recognition]:
+        """Compare new keyframes, from index `since` on, with older ones that they share no landmarks with.
+
+        Returns recognitions of AGREEING keyframes at least that agree on where they are; none without a loop.
+        """
+        for k in range(max(since, self._pause_until, YOUNGEST + 1), len(landmarks.keyframes)):
+            same = self._compared(landmarks, k)
+            if len({each.by.number for each in same}) >= AGREEING:
+                self._found.clear()
+                self._pause_until = len(landmarks.keyframes) + PAUSE
+                return same
+        return []
+
+    def _compared(self, landmarks: LandmarkMap, k: int) -> list[Recognition]:
+        """Compare keyframe k. Returns a notable recognition of it with those that agree; none if there is none."""
+        by = landmarks.keyframes[k]
+        seen = np.zeros(len(landmarks.known), dtype=bool)
+        seen[by.ids[landmarks.known[by.ids]]] = True
+        old = [each for each in landmarks.keyframes[: k + 1 - YOUNGEST] if seen[each.ids].sum() < SHARED]
+        candidates = self._index.alike(by, old, CANDIDATES, LEAST_LIKENESS)
+        if old:
+            self._found = [each for each in self._found if k - each[0] <= REMEMBERED]
+        best: list[Recognition] = []
+        for at in candidates:
+            found = recognised(landmarks, old[at], landmarks, by, self._seed)
+            if found is None:
+                continue
+            # Relative to the scene's depth. The sum is about the motion of the picture, in focal lengths.
+            turn, shift = turn_and_shift(found.T_camera_world, found.by.T_camera_world)
+            if turn > LARGEST_TURN or (turn + shift / found.depth) * landmarks.lens.focal < NOTABLE:
+                continue
+            self._found.append((k, found))
+            best = max(best, agreeing([each for _, each in self._found], found), key=len)
+        return best
 
     def _take(self, search: _Search, tracking: Tracking) -> None:
         """Wait for the result of a search and take it, unless the map has been joined or has another camera since."""
@@ -137,25 +197,6 @@ class LoopClosing:
             self.undone += 1
 
 
-def closed_map(landmarks: LandmarkMap, found: Sequence[Recognition]) -> LandmarkMap | None:
-    """Close a loop in a copy of a map.
-
-    Args:
-        landmarks: The map.
-        found: Recognitions that agree.
-
-    Returns:
-        The adjusted copy; None if it contradicts the loop.
-    """
-    place = {keyframe.number: k for k, keyframe in enumerate(landmarks.keyframes)}
-    links = [Link(place[each.of.number], place[each.by.number], _relation(each)) for each in found]
-    depth = float(np.median([each.depth for each in found]))
-    poses = [keyframe.T_camera_world for keyframe in landmarks.keyframes]
-    after = landmarks.copy()
-    after.move(closed_loop(poses, connected_keyframes(landmarks), links, depth))
-    return after if connected(after, found, apart=True) else None
-
-
 def connected_keyframes(landmarks: LandmarkMap) -> list[tuple[int, int]]:
     """Pairs of keyframes that follow each other or share at least NEAR_SHARED landmarks."""
     of, ids, _ = landmarks.observations(range(len(landmarks.keyframes)))
@@ -167,105 +208,6 @@ def connected_keyframes(landmarks: LandmarkMap) -> list[tuple[int, int]]:
     return [*((k, k + 1) for k in range(len(seen) - 1)), *((int(a), int(b)) for a, b in pairs)]
 
 
-def _relation(found: Recognition) -> NDArray[np.float64]:
-    """Similarity (4, 4) from the camera frame of `by`, in the scale around it, to that of `of`."""
-    s = float(scale_of(found.S_of_by))
-    return found.of.T_camera_world @ inverse_se3(found.T_camera_world) @ np.diag([s, s, s, 1.0])
-
-
-class LoopDetection:
-    """Finds the loops of a map while it grows.
-
-    Args:
-        seed: Seed of RANSAC and of the vocabulary.
-    """
-
-    def __init__(self, seed: int) -> None:
-        self._seed = seed
-        self._index = PlaceIndex(seed)
-        self._found: list[tuple[int, Recognition]] = []  # with the index of the keyframe
-        self._pause_until = 0
-
-    def begin_anew(self) -> None:
-        """Forget the recognitions, because keyframes will have other indices."""
-        self._found.clear()
-        self._pause_until = 0
-
-    def search(self, landmarks: LandmarkMap, since: int) -> list[Recognition]:
-        """Compare new keyframes, from index `since` on, with older ones that they share no landmarks with.
-
-        Returns:
-            Recognitions of AGREEING keyframes at least that agree on where they are; none without a loop.
-        """
-        for k in range(max(since, self._pause_until, YOUNGEST + 1), len(landmarks.keyframes)):
-            same = self._compared(landmarks, k)
-            if len({each.by.number for each in same}) >= AGREEING:
-                self._found.clear()
-                self._pause_until = len(landmarks.keyframes) + PAUSE
-                return same
-        return []
-
-    def _compared(self, landmarks: LandmarkMap, k: int) -> list[Recognition]:
-        """Compare keyframe k. Returns a notable recognition of it with those that agree; none if there is none."""
-        by = landmarks.keyframes[k]
-        seen = np.zeros(len(landmarks.known), dtype=bool)
-        seen[by.ids[landmarks.known[by.ids]]] = True
-        old = [each for each in landmarks.keyframes[: k + 1 - YOUNGEST] if seen[each.ids].sum() < SHARED]
-        if not old:
-            return []
-        likeness = self._index.likeness(by, old)
-        self._found = [each for each in self._found if k - each[0] <= REMEMBERED]
-        best: list[Recognition] = []
-        for at in np.argsort(-likeness, kind="stable")[:CANDIDATES]:
-            if likeness[at] < LEAST_LIKENESS:
-                break
-            found = recognised(landmarks, old[at], landmarks, by, self._seed)
-            if found is None:
-                continue
-            turn, shift = _offset(found)
-            if turn > LARGEST_TURN or (turn + shift) * landmarks.lens.focal < NOTABLE:
-                continue
-            self._found.append((k, found))
-            best = max(best, agreeing([each for _, each in self._found], found), key=len)
-        return best
-
-
-def _offset(found: Recognition) -> tuple[float, float]:
-    """How far the place where `by` was recognised is from where the map has it.
-
-    Returns:
-        The turn [radians], and the shift relative to the scene's depth. Their sum is about the motion of the picture,
-        in focal lengths.
-    """
-    off = found.T_camera_world @ inverse_se3(found.by.T_camera_world)
-    turn = float(np.arccos(np.clip((np.trace(off[:3, :3]) - 1.0) / 2.0, -1.0, 1.0)))
-    return turn, float(np.linalg.norm(off[:3, 3])) / found.depth
-
-
-@dataclass(frozen=True)
-class Link:
-    """A measured relation of two keyframes.
-
-    Attributes:
-        a: Index of the one keyframe.
-        b: Index of the other.
-        T_a_b: (4, 4) similarity from the camera frame of b, in the scale around it, to that of a.
-    """
-
-    a: int
-    b: int
-    T_a_b: NDArray[np.float64]
-
-
-def solver_is_there() -> bool:
-    """Whether gtsam, which has no wheel for some platforms, is installed."""
-    try:
-        import gtsam  # noqa: F401
-    except ImportError:
-        return False
-    return True
-
-
 def closed_loop(
     poses: Sequence[NDArray[np.float64]], near: Sequence[tuple[int, int]], loops: Sequence[Link], depth: float
 ) -> list[NDArray[np.float64]]:
@@ -274,7 +216,7 @@ def closed_loop(
     Args:
         poses: T_camera_world (4, 4) of the keyframes. The first one stays.
         near: Pairs of keyframes whose relation shall stay as it is.
-        loops: Relations that recognised places tell.
+        loops: Relations by recognised places, in the scale around each keyframe.
         depth: Typical depth of the scene.
 
     Returns:
@@ -286,7 +228,7 @@ def closed_loop(
     cameras = [inverse_se3(T) for T in poses]
 
     def similarity(matrix: NDArray[np.float64]) -> gtsam.Similarity3:
-        s = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
+        s = float(scale_of(matrix))
         return gtsam.Similarity3(matrix[:3, :3] / s, matrix[:3, 3] / (s * depth), s)  # acts as s (R x + t)
 
     noise = gtsam.noiseModel.Isotropic.Sigma(7, SIGMA)
@@ -295,8 +237,8 @@ def closed_loop(
     graph.add(gtsam.PriorFactorSimilarity3(0, similarity(cameras[0]), gtsam.noiseModel.Isotropic.Sigma(7, 1e-6)))
     for a, b in near:
         graph.add(gtsam.BetweenFactorSimilarity3(a, b, similarity(poses[a] @ cameras[b]), noise))
-    for link in loops:
-        graph.add(gtsam.BetweenFactorSimilarity3(link.a, link.b, similarity(link.T_a_b), noise))
+    for a, b, T_a_b in loops:
+        graph.add(gtsam.BetweenFactorSimilarity3(a, b, similarity(T_a_b), noise))
     options = gtsam.LevenbergMarquardtParams()
     options.setMaxIterations(STEPS)
     result = gtsam.LevenbergMarquardtOptimizer(graph, start, options).optimize()
@@ -372,8 +314,7 @@ def _take_observations(landmarks: LandmarkMap, before: LandmarkMap, after: Landm
         keyframe = landmarks.keyframes[k]
         made = ~np.isin(new.ids, old.ids) & ~np.isin(id_of[new.ids], keyframe.ids)
         ids, pixels = id_of[new.ids[made]], new.pixels[made]
-        keyframe.append(ids, pixels, new.rays[made])
-        landmarks.note_observations(k, ids, pixels)
+        landmarks.observe(k, ids, pixels)
         if new.described is None:
             continue
         if keyframe.described is None:

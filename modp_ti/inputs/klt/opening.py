@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
+from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,20 +11,9 @@ from numpy.typing import NDArray
 
 from fields.geometry.camera import PinholeCamera
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.klt.camera import (
-    ADVICE,
-    BEFORE_TRACKING,
-    FOCAL_FROM,
-    TYPICAL_FOCAL,
-    Lens,
-    estimation_note,
-    intrinsics_of,
-    is_plausible,
-)
-from modp_ti.inputs.klt.loop_closing import solver_is_there
+from modp_ti.inputs.klt.camera import ADVICE, BEFORE_TRACKING, FOCAL_FROM, TYPICAL_FOCAL, Lens, estimation_note
 from modp_ti.inputs.klt.odometry import Odometry
-from modp_ti.inputs.klt.selected_images import available, followed_scale, read_image, require_size
-from modp_ti.inputs.klt.tracker import KltTracker
+from modp_ti.inputs.klt.tracker import KltTracker, available, followed, grey_image, require_size
 from modp_ti.inputs.opening import open_source, require_pinhole
 from modp_ti.inputs.protocol import Progress
 from modp_ti.inputs.readers.klt import KltSettings
@@ -67,7 +57,7 @@ def open_klt(
     """
     settings = settings or KltSettings()
     loops = settings.loops
-    if loops and not solver_is_there():
+    if loops and find_spec("gtsam") is None:
         raise InputError(
             "tracker.loops needs gtsam (Linux and macOS, Python 3.11 or newer): pip install 'modp-ti[loops]'"
         )
@@ -113,37 +103,27 @@ def _guessed(reader: FrameReader, blank: Intrinsics) -> tuple[Intrinsics, str]:
     """Guess the camera from EXIF, or take a typical one. Returns it with a note for the user."""
     width, height = blank.camera.width, blank.camera.height
     film = focal_length_35mm(reader.images.path / available(reader)[0])
-    focal = (
-        TYPICAL_FOCAL * max(width, height) if film is None else film / DIAGONAL_35MM * float(np.hypot(width, height))
-    )
-    origin = "is what EXIF says" if film is not None else "is a guess, for the images do not tell"
+    focal, origin = TYPICAL_FOCAL * max(width, height), "is a guess, for the images do not tell"
+    if film is not None:
+        focal, origin = film / DIAGONAL_35MM * float(np.hypot(width, height)), "is what EXIF says"
     camera = PinholeCamera(focal, focal, width / 2, height / 2, width, height)
     return Intrinsics(camera), f"the camera is not known: focal length {focal:.1f} px {origin}; {ADVICE}"
 
 
 def _estimated(reader: FrameReader, blank: Intrinsics, seed: int, progress: Progress | None) -> tuple[Intrinsics, str]:
     """Estimate the camera from EXIF and the images. Returns it with a note for the user."""
-    width, height = blank.camera.width, blank.camera.height
-    there = available(reader)
+    there, undistorter = available(reader), followed(blank)
     guess, note = _guessed(reader, blank)
     stride = int(np.clip(len(there) // CALIBRATION_FRAMES, 1, CALIBRATION_STRIDE))
-    undistorter = blank.undistorter(followed_scale(width, height))
-
-    def images() -> Iterator[tuple[NDArray[np.uint8], NDArray[np.bool_] | None]]:
-        for name in there[: stride * CALIBRATION_FRAMES : stride]:
-            raw = read_image(reader.images, name, width, height)
-            yield undistorter.grey(raw, reader.valid(name, raw))
-
+    images = (grey_image(reader, name, undistorter)[1:] for name in there[: stride * CALIBRATION_FRAMES : stride])
     total = min(CALIBRATION_FRAMES, len(there))
-    found, used = estimated_intrinsics(images(), (width, height), guess.camera.fx, seed, progress, total)
+    size = blank.camera.width, blank.camera.height
+    found, used = estimated_intrinsics(images, size, guess.camera.fx, seed, progress, total)
     return (guess, note) if found is None else (found, estimation_note(found, used))
 
 
-Image = tuple[NDArray[np.uint8], NDArray[np.bool_] | None]
-
-
 def estimated_intrinsics(
-    images: Iterable[Image],
+    images: Iterable[tuple[NDArray[np.uint8], NDArray[np.bool_] | None]],
     size: tuple[int, int],
     start: float,
     seed: int,
@@ -173,7 +153,7 @@ def estimated_intrinsics(
         if odometry is None:
             scale = grey.shape[1] / size[0]
             lens = Lens.radial(start * scale, 0.0, grey.shape[1], grey.shape[0])
-            odometry = Odometry([lens], seed, BEFORE_TRACKING)
+            odometry = Odometry(lens, seed, BEFORE_TRACKING)
         odometry.process(used, grey, valid)
         used += 1
         if progress is not None:
@@ -187,4 +167,4 @@ def estimated_intrinsics(
         return None, used
     tracking.refine_camera()
     lens = tracking.map.lens
-    return (intrinsics_of(lens, size) if is_plausible(lens) else None), used
+    return (lens.intrinsics(*size) if lens.is_plausible else None), used

@@ -17,9 +17,9 @@ from modp_ti.inputs.multiview.features import Features, essential_matrix, match_
 from modp_ti.inputs.multiview.reprojection import pose_from_points, ray_errors
 
 # Thresholds in px of the tracked image. MAX_ERROR is RANSAC's, and is wide because many depths are those of neighbours.
-# A SIFT feature nearer than SAME_PLACE to a landmark takes its depth.
+# A SIFT feature nearer than AT_LANDMARK to a landmark takes its depth.
 MAX_ERROR = 5.0
-SAME_PLACE = 2.0
+AT_LANDMARK = 0.06
 MAX_OFF_LINE = 3.0  # distance to the epipolar line
 NEIGHBOURHOOD = 40.0  # distance to landmarks from which a depth is interpolated
 FEWEST = 15  # fewest inlier matches of a pose
@@ -34,6 +34,8 @@ LARGEST_SPREAD = 0.25  # median deviation of the ratio of depths, relative
 # Differences between two recognitions that agree: of a camera's place relative to the scene's depth, its direction
 # [radians], and the scale.
 SAME_PLACE, SAME_DIRECTION, SAME_SCALE = 0.06, 0.05, 0.1
+AGREEING = 3  # keyframes whose recognitions must agree before two places are connected
+PAUSE = 5  # keyframes after a loop, or a join that was refused, in which none is sought
 
 
 def thumbnail(grey: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -41,12 +43,6 @@ def thumbnail(grey: NDArray[np.uint8]) -> NDArray[np.float32]:
     small = cv2.GaussianBlur(cv2.resize(grey, THUMBNAIL, interpolation=cv2.INTER_AREA), (5, 5), 0).astype(np.float32)
     small -= small.mean()
     return (small / max(float(np.linalg.norm(small)), 1.0)).reshape(-1)
-
-
-def alike_keyframes(thumbnails: NDArray[np.float32], grey: NDArray[np.uint8], count: int) -> list[int]:
-    """Indices of the `count` keyframes whose thumbnails are most similar to the image, best first."""
-    likeness = thumbnails @ thumbnail(grey)
-    return [int(k) for k in np.argsort(-likeness, kind="stable")[:count]]
 
 
 def place_by_features(
@@ -112,9 +108,7 @@ def inherited(
     fresh = keyframe.described_ids[slots] < 0
     ids = landmarks.new_ids(int(fresh.sum()))
     keyframe.described_ids[slots[fresh]] = ids
-    pixels = described.pixels[slots[fresh]]
-    keyframe.append(ids, pixels, landmarks.lens.rays(pixels))
-    landmarks.note_observations(k, ids, pixels)
+    landmarks.observe(k, ids, described.pixels[slots[fresh]])
     return keyframe.described_ids[slots], b
 
 
@@ -148,7 +142,7 @@ def world_points(landmarks: LandmarkMap, keyframe: Keyframe) -> NDArray[np.float
     around = depth[nearest]
     middle = np.median(around, axis=1)
     agree = (np.ptp(around, axis=1) < 0.1 * middle) & (away.max(axis=1) < NEIGHBOURHOOD) & (middle > 0)
-    at_one = away.min(axis=1) < SAME_PLACE
+    at_one = away.min(axis=1) < AT_LANDMARK
     z = np.where(at_one, around[np.arange(len(around)), away.argmin(axis=1)], middle)
     lent = np.flatnonzero((agree | at_one) & ~np.isfinite(xyz[:, 0]) & (z > 0))
     point = np.c_[landmarks.lens.rays(pixels[lent]), np.ones(len(lent))] * z[lent, None] - T[:3, 3]
@@ -171,26 +165,25 @@ class PlaceIndex:
         self._trained_on = 0  # keyframes
         self._vectors: dict[int, NDArray[np.float32]] = {}  # by number of the keyframe
 
-    def likeness(self, keyframe: Keyframe, others: Sequence[Keyframe]) -> NDArray[np.float32]:
-        """Cosines (N,) between the descriptor of a keyframe and those of N others."""
-        self._train([keyframe, *others])
+    def alike(self, keyframe: Keyframe, others: Sequence[Keyframe], count: int, least: float = -np.inf) -> list[int]:
+        """Indices of the `count` others most similar to a keyframe, best first, whose cosine is at least `least`."""
+        if not others:
+            return []
+        if len(others) + 1 >= 2 * self._trained_on:
+            rows = [described_keyframe(each).descriptors for each in (keyframe, *others)]
+            stride = max(1, -(-sum(map(len, rows)) // TRAINED_ON))
+            self._words = vocabulary(np.concatenate(rows)[::stride], WORDS, self._seed)
+            self._trained_on = len(rows)
+            self._vectors.clear()
         mine = self._vector(keyframe)
-        return np.array([self._vector(other) @ mine for other in others], np.float32)
+        likeness = np.array([self._vector(other) @ mine for other in others], np.float32)
+        return [int(k) for k in np.argsort(-likeness, kind="stable")[:count] if likeness[k] >= least]
 
     def _vector(self, keyframe: Keyframe) -> NDArray[np.float32]:
         vector = self._vectors.get(keyframe.number)
         if vector is None:
             vector = self._vectors[keyframe.number] = vlad(described_keyframe(keyframe).descriptors, self._words)
         return vector
-
-    def _train(self, keyframes: Sequence[Keyframe]) -> None:
-        if len(keyframes) < 2 * self._trained_on:
-            return
-        rows = [described_keyframe(keyframe).descriptors for keyframe in keyframes]
-        stride = max(1, -(-sum(map(len, rows)) // TRAINED_ON))
-        self._words = vocabulary(np.concatenate(rows)[::stride], WORDS, self._seed)
-        self._trained_on = len(keyframes)
-        self._vectors.clear()
 
 
 def vocabulary(descriptors: NDArray[np.uint8], count: int, seed: int) -> NDArray[np.float32]:
@@ -271,13 +264,18 @@ def agreeing(found: Sequence[Recognition], newest: Recognition) -> list[Recognit
     return [each for each in found if each is newest or _agree(each, newest)]
 
 
+def turn_and_shift(T_a: NDArray[np.float64], T_b: NDArray[np.float64]) -> tuple[float, float]:
+    """The turn [radians] and the distance between two poses (4, 4) of a camera."""
+    off = T_a @ inverse_se3(T_b)
+    return float(np.arccos(np.clip((np.trace(off[:3, :3]) - 1.0) / 2.0, -1.0, 1.0))), float(np.linalg.norm(off[:3, 3]))
+
+
 def _agree(one: Recognition, other: Recognition) -> bool:
     """Whether the similarity of the one leads the camera of the other to where it was found, and the reverse."""
     if abs(np.log(scale_of(one.S_of_by) / scale_of(other.S_of_by))) > SAME_SCALE:
         return False
     for a, b in ((one, other), (other, one)):
-        off = moved_pose(a.S_of_by, b.by.T_camera_world) @ inverse_se3(b.T_camera_world)
-        turn = np.arccos(np.clip((np.trace(off[:3, :3]) - 1) / 2, -1, 1))
-        if np.linalg.norm(off[:3, 3]) > SAME_PLACE * b.depth or turn > SAME_DIRECTION:
+        turn, shift = turn_and_shift(moved_pose(a.S_of_by, b.by.T_camera_world), b.T_camera_world)
+        if shift > SAME_PLACE * b.depth or turn > SAME_DIRECTION:
             return False
     return True

@@ -9,18 +9,50 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from modp_ti.files.errors import InputError, UnreadableImageError
-from modp_ti.inputs.klt.camera import WHILE_TRACKING, Lens, estimation_note, intrinsics_of
-from modp_ti.inputs.klt.delivered_trajectory import DeliveredFrame, DeliveredTrajectory
+from modp_ti.inputs.klt.camera import WHILE_TRACKING, Lens, estimation_note
+from modp_ti.inputs.klt.delivered_trajectory import DeliveredTrajectory
 from modp_ti.inputs.klt.odometry import Odometry
-from modp_ti.inputs.klt.selected_images import arriving, available, followed_scale, read_image
 from modp_ti.inputs.klt.tracking import View
 from modp_ti.inputs.protocol import Event, LiveCounts, Progress, Tracker
-from modp_ti.inputs.replay import PosedImage, Unreadable, pictures_again, tracked_frame
-from modp_ti.inputs.sources import FrameReader, Intrinsics, Picture, Undistorter
+from modp_ti.inputs.replay import Unreadable, pictures_again, tracked_frame
+from modp_ti.inputs.sources import FrameReader, ImageSource, Intrinsics, Picture, Undistorter
 
+FOLLOWED_SIDE = 640  # longer side [px] of the images in which features are tracked, at most
 BEGINS_ANEW_AFTER = 10  # frames without a pose after which another map may begin
+
+
+def available(reader: FrameReader) -> Sequence[str]:
+    """Names of the selected images that are available so far."""
+    source = reader.source
+    return reader.images.names[source.start : source.stop : source.step]
+
+
+def followed(intrinsics: Intrinsics) -> Undistorter:
+    """Undistortion of the stored images to those in which features are tracked."""
+    return intrinsics.undistorter(min(1.0, FOLLOWED_SIDE / max(intrinsics.camera.width, intrinsics.camera.height)))
+
+
+def grey_image(
+    reader: FrameReader, name: str, undistorter: Undistorter
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.bool_] | None]:
+    """Decode an image. Returns it (H, W, 3), the grey one in which features are tracked, and its valid pixels.
+
+    Raises:
+        InputError: If it has another size than the first one.
+    """
+    raw = reader.images.read(name)
+    require_size(reader.images, name, (raw.shape[1], raw.shape[0]), (undistorter.raw.width, undistorter.raw.height))
+    return raw, *undistorter.grey(raw, reader.valid(name, raw))
+
+
+def require_size(images: ImageSource, name: str, size: tuple[int, int], first: tuple[int, int]) -> None:
+    """Raise InputError if an image is not of the first one's size (width, height)."""
+    if size != first:
+        raise InputError(
+            f"{images.path / name} is {size[0]}x{size[1]}, the first image {first[0]}x{first[1]}: klt follows images "
+            "of one size; take the others out, or set tracker.kind=sfm"
+        )
 
 
 class KltTracker(Tracker):
@@ -64,19 +96,15 @@ class KltTracker(Tracker):
         further: bool = False,
         progress: Progress | None = None,
     ) -> None:
-        self._notes = list(notes)
         self.intrinsics = intrinsics
+        self._notes = list(notes)
         self._reader = reader
-        camera = intrinsics.camera
-        self._followed = intrinsics.undistorter(followed_scale(camera.width, camera.height))
+        self._followed = followed(intrinsics)
         self._delivered = intrinsics.undistorter(reader.images.scale)
-        followed = self._followed.camera
-        if is_guess:
-            self._lens = Lens.radial(followed.fx, 0.0, followed.width, followed.height)
-        else:
-            self._lens = Lens.pinhole(followed)
+        camera = self._followed.camera
+        self._lens = Lens.radial(camera.fx, 0.0, camera.width, camera.height) if is_guess else Lens.pinhole(camera)
         self._odometry = Odometry(
-            [self._lens],
+            self._lens,
             seed,
             WHILE_TRACKING if is_guess else None,
             BEGINS_ANEW_AFTER,
@@ -88,11 +116,12 @@ class KltTracker(Tracker):
         self._trajectory: DeliveredTrajectory | None = None
         self._unreadable = Unreadable()
         self._place, self._further, self._tell = place, further, progress
+        self._names: list[str] = []  # of the images so far
         self._skipped = 0
-        self._progress = self._tracked()
+        self._events = self._tracked()
         if place is not None:  # which frames there are is known when all are tracked
-            first = next(self._progress, None)
-            self._progress = chain(() if first is None else (first,), self._progress)
+            first = next(self._events, None)
+            self._events = chain(() if first is None else (first,), self._events)
 
     def __iter__(self) -> Iterator[Event]:
         """Iterate once over frames and corrections.
@@ -100,7 +129,7 @@ class KltTracker(Tracker):
         Raises:
             InputError: If too many images are unreadable, their sizes differ, or no frame can be localised.
         """
-        return self._progress
+        return self._events
 
     def pictures(self, names: Sequence[str]) -> Iterator[tuple[str, Picture]]:
         return pictures_again(self._reader, ((name, self._delivered) for name in names))
@@ -151,119 +180,101 @@ class KltTracker(Tracker):
         self._reader.images.close()
 
     def _tracked(self) -> Iterator[Event]:
-        names: list[str] = []
-        raw_camera = self.intrinsics.camera
-        for number, name in enumerate(arriving(self._reader)):
+        names, odometry, source = self._names, self._odometry, self._reader.source
+        for number, name in enumerate(self._reader.images.arriving(source.start, source.stop, source.step)):
             names.append(name)
             if self._place is not None and self._tell is not None:
                 self._tell("tracking", number, len(available(self._reader)))
             try:
-                raw = read_image(self._reader.images, name, raw_camera.width, raw_camera.height)
+                raw, grey, valid = grey_image(self._reader, name, self._followed)
             except UnreadableImageError as error:
                 self._unreadable.add(name, error, max(len(names), len(available(self._reader))))
                 continue
-            grey, valid = self._followed.grey(raw, self._reader.valid(name, raw))
-            views = self._odometry.process(number, grey, valid)
-            yield from self._delivered_events(names, views, raw)
-        views = self._odometry.finish()
-        if self._place is not None and self._place > max(1, self._odometry.places):
+            yield from self._delivered_events(odometry.process(number, grey, valid), raw)
+        views = odometry.finish()
+        if self._place is not None and self._place > max(1, odometry.places):
             raise InputError(
-                f"tracker.maps: {self._place}: klt made {self._odometry.places} maps of {self._reader.images.path}"
+                f"tracker.maps: {self._place}: klt made {odometry.places} maps of {self._reader.images.path}"
             )
-        yield from self._delivered_events(names, views, last=True)
+        yield from self._delivered_events(views, last=True)
         if self._trajectory is not None:
             self._skipped = len(names) - len(self._trajectory.frames)
             yield from self._trajectory.corrections(last=True)
-        self._sum_up(names)
+        self._notes += self._summary()
 
     def _delivered_events(
-        self, names: Sequence[str], views: Sequence[View], raw: NDArray[np.uint8] | None = None, last: bool = False
+        self, views: Sequence[View], raw: NDArray[np.uint8] | None = None, last: bool = False
     ) -> Iterator[Event]:
-        """Deliver what has changed and the next views.
+        """Deliver what has changed and the next views; with `last`, no other map can be joined any more.
 
-        Args:
-            names: Names of the images so far.
-            views: The views.
-            raw: The last image.
-            last: No other map can be joined any more.
+        `raw` is the last image.
         """
-        tracking = self._odometry.tracking
+        tracking, names, trajectory = self._odometry.tracking, self._names, self._trajectory
         if tracking is None:
             return
         if tracking.map.lens is not self._lens:
             self._estimated_from = len(names)
-            self._take_lens(tracking.map.lens)
-            if self._trajectory is not None:
-                yield self._trajectory.revise_camera(self._delivered)
-        elif self._trajectory is not None:
-            yield from self._trajectory.corrections()
-        if self._trajectory is None:
-            self._trajectory = DeliveredTrajectory(tracking, self._delivered)
+            self._lens, stored = tracking.map.lens, self.intrinsics.camera
+            self.intrinsics = self._lens.intrinsics(stored.width, stored.height)
+            self._delivered = self.intrinsics.undistorter(self.scale)
+            if trajectory is not None:
+                yield trajectory.revise_camera(self._delivered)
+        elif trajectory is not None:
+            yield from trajectory.corrections()
+        if trajectory is None:
+            trajectory = self._trajectory = DeliveredTrajectory(tracking, self._delivered)
         waiting = 0 if last else sum(map(len, self._odometry.waiting))
-        self._skipped = len(names) - len(self._trajectory.frames) - len(views) - waiting
+        self._skipped = len(names) - len(trajectory.frames) - len(views) - waiting
         for view in views:
-            delivered = self._trajectory.add(names[view.number], view)
-            points, index = self._trajectory.points(delivered), len(self._trajectory.frames) - 1
-            frame = self._frame(index, delivered, points, raw if view.number == len(names) - 1 else None)
-            self._trajectory.record(frame.points)
+            posed = trajectory.add(names[view.number], view)
+            own = raw if view.number == len(names) - 1 else None
+            frame = tracked_frame(self._reader, len(trajectory.frames) - 1, posed, raw=own)
+            trajectory.record(frame.points)
             yield frame
         if tracking.camera_is_final:
-            self._trajectory.forget_points()
+            trajectory.forget_points()
 
-    def _take_lens(self, lens: Lens) -> None:
-        """Take a new estimate of the camera."""
-        raw = self.intrinsics.camera
-        self._lens = lens
-        self.intrinsics = intrinsics_of(lens, (raw.width, raw.height))
-        self._delivered = self.intrinsics.undistorter(self.scale)
-
-    def _sum_up(self, names: Sequence[str]) -> None:
-        if self._odometry.tracking is None or self._trajectory is None:
-            images = self._reader.images
+    def _summary(self) -> Iterator[str]:
+        """The notes at the end."""
+        names, odometry, images = self._names, self._odometry, self._reader.images
+        if self._trajectory is None:
             before = "" if images.ending is None else f" before the recording ended ({images.ending})"
             raise InputError(
                 f"{images.path}: klt could place none of the {len(names)} images{before}: they need texture, and a "
                 "camera that moves sideways and does not only turn; photographs in no order need tracker.kind=sfm"
             )
-        if self._odometry.loops:
-            self._notes.append(f"klt closed {self._odometry.loops} loops")
-        if self._odometry.undone:
-            self._notes.append(f"klt undid {self._odometry.undone} loops or joins, which the adjusted map contradicted")
+        if odometry.loops:
+            yield f"klt closed {odometry.loops} loops"
+        if odometry.undone:
+            yield f"klt undid {odometry.undone} loops or joins, which the adjusted map contradicted"
         if self._estimated_from:
-            self._notes.append(estimation_note(self.intrinsics, self._estimated_from))
+            yield estimation_note(self.intrinsics, self._estimated_from)
+        if self._unreadable:
+            yield self._unreadable.note(len(names))
         placed = {frame.name for frame in self._trajectory.frames} | set(self._unreadable)
         without = [name for name in names if name not in placed]
-        if self._unreadable:
-            self._notes.append(self._unreadable.note(len(names)))
         if without:
-            self._notes.append(
+            yield (
                 f"{len(without)} of {len(names)} images could not be placed (the first is {without[0]}): skipped; the "
-                f"camera was found again {self._odometry.recovered} times; photographs in no order need "
-                "tracker.kind=sfm"
+                f"camera was found again {odometry.recovered} times; photographs in no order need tracker.kind=sfm"
             )
-        apart = self._odometry.waiting
+        apart = odometry.waiting
         if apart:
             largest = max(apart, key=len)
-            said = (
-                f"{sum(map(len, apart))} of these images are in {len(apart)} other maps, which show no place of the "
-                f"run's map; the largest has {len(largest)} images, {names[largest[0]]} to {names[largest[-1]]}"
-            )
-            said += (
-                f": {self.further_maps} of them are mapped in runs of their own"
+            mapped = (
+                f"{self.further_maps} of them are mapped in runs of their own"
                 if self._further
-                else ": tracker.maps: all maps each in a run of its own"
+                else "tracker.maps: all maps each in a run of its own"
             )
-            self._notes.append(said)
-        if self._odometry.unsolved:
-            self._notes.append(
-                f"{self._odometry.unsolved} bundle adjustments of klt had no solution and were left out: "
+            yield (
+                f"{sum(map(len, apart))} of these images are in {len(apart)} other maps, which show no place of the "
+                f"run's map; the largest has {len(largest)} images, {names[largest[0]]} to {names[largest[-1]]}: "
+                f"{mapped}"
+            )
+        if odometry.unsolved:
+            yield (
+                f"{odometry.unsolved} bundle adjustments of klt had no solution and were left out: "
                 "GLOG_minloglevel=0 in the environment shows what Ceres says"
             )
-        if self._odometry.joined:
-            self._notes.append(f"the track was lost, and {self._odometry.joined} maps begun anew were joined with it")
-
-    def _frame(
-        self, index: int, delivered: DeliveredFrame, points: SparsePoints, raw: NDArray[np.uint8] | None = None
-    ) -> TrackedFrame:
-        frame = PosedImage(delivered.name, self._delivered, delivered.T_camera_world, points)
-        return tracked_frame(self._reader, index, frame, raw=raw)
+        if odometry.joined:
+            yield f"the track was lost, and {odometry.joined} maps begun anew were joined with it"

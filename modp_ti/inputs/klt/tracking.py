@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from bisect import bisect_right
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fields.geometry.se3 import inverse_se3, moved_pose, orthonormalised, scale_of
-from modp_ti.inputs.klt.camera import CameraRefinement, is_plausible
+from fields.geometry.se3 import inverse_se3, orthonormalised, scale_of
+from modp_ti.inputs.klt.camera import CameraRefinement
 from modp_ti.inputs.klt.frame import Frame, LocalisedFrame
 from modp_ti.inputs.klt.landmark_map import Keyframe, LandmarkMap
 from modp_ti.inputs.klt.localisation import FEWEST, SIGMA, localised, predicted_pixels, realigned, searched
-from modp_ti.inputs.klt.recognition import alike_keyframes, inherited, place_by_features, thumbnail
+from modp_ti.inputs.klt.recognition import inherited, place_by_features, thumbnail
 from modp_ti.inputs.multiview.bundle_adjustment import Refinable
 from modp_ti.inputs.multiview.reprojection import refine_pose
 
@@ -24,11 +23,13 @@ KEYFRAME_SHIFT = 0.05
 KEYFRAME_SHARE = 0.65
 WINDOW = 8  # free keyframes of a local bundle adjustment
 HELD = 12  # fixed keyframes of a local bundle adjustment, at most
+LEAST_SHARED = 15  # landmarks that they share with the free ones
 WIDE_EVERY = 12  # keyframes between bundle adjustments of WIDE_WINDOW free ones
 WIDE_WINDOW = 30
 # Relocalisation is tried at each of the first EAGER frames after the track was lost, then at every LAZY-th frame.
 EAGER = 10
 LAZY = 5
+ALIKE = 3  # keyframes that look most like a frame, with which it is compared then
 
 
 @dataclass
@@ -37,7 +38,7 @@ class View:
 
     Attributes:
         number: Number of the frame.
-        keyframe: Its keyframe.
+        keyframe: Number of its keyframe.
         T_camera_keyframe: (4, 4) pose relative to the keyframe.
         ids: (N,) landmarks that it sees.
         pixels: (N, 2) their positions in the tracked image.
@@ -45,20 +46,15 @@ class View:
     """
 
     number: int
-    keyframe: Keyframe
+    keyframe: int
     T_camera_keyframe: NDArray[np.float64]
     ids: NDArray[np.int64]
     pixels: NDArray[np.float64]
-    scale: float = 1.0
+    scale: float
 
-    @property
-    def T_camera_world(self) -> NDArray[np.float64]:  # noqa: N802  # a transform is named by its ends
-        """(4, 4) pose in the current map."""
-        T = self.T_camera_keyframe
-        if self.scale != self.keyframe.scale:
-            T = T.copy()
-            T[:3, 3] *= self.keyframe.scale / self.scale
-        return orthonormalised(T @ self.keyframe.T_camera_world)
+    def forget_landmarks(self) -> None:
+        """Keep the pose only."""
+        self.ids, self.pixels = self.ids[:0].copy(), self.pixels[:0].copy()
 
 
 class Tracking:
@@ -72,6 +68,7 @@ class Tracking:
 
     Attributes:
         map: The map.
+        waiting: Views that have not been delivered.
         motion: (4, 4) T_camera_camera from the frame before to the last one, which predicts the next pose.
         recovered: Number of frames that were relocalised after the track was lost.
     """
@@ -84,6 +81,7 @@ class Tracking:
         refinement: CameraRefinement | None = None,
     ) -> None:
         self.map = landmarks
+        self.waiting: list[View] = []
         self.motion = np.eye(4)
         self.recovered = 0
         self._seed = seed
@@ -92,16 +90,58 @@ class Tracking:
         self._lost_for = 0
         self._counted = len(landmarks.keyframes)  # when the map was last adjusted
         self._wide_is_due = False
-        start = landmarks.keyframes[-1]
-        last = LocalisedFrame(
-            start.number, start.grey, valid, start.ids, start.pixels, T_camera_world=start.T_camera_world
-        )
+        last = landmarks.keyframes[-1].frame(valid)
         self._replenish(last)
-        self._last: LocalisedFrame | None = last
+        self._last: LocalisedFrame | None = last  # if it is a keyframe, the two share the array of their pose
 
     def pose(self, view: View) -> NDArray[np.float64]:
         """T_camera_world (4, 4) of a view in the current map."""
-        return view.T_camera_world
+        keyframe, T = self.map.keyframes[self.map.index(view.keyframe)], view.T_camera_keyframe
+        if view.scale != keyframe.scale:
+            T = T.copy()
+            T[:3, 3] *= keyframe.scale / view.scale
+        return orthonormalised(T @ keyframe.T_camera_world)
+
+    def start(self, frames: Sequence[Frame]) -> list[View]:
+        """Localise the frames of the initialisation, those before the first keyframe by tracking backwards in time.
+
+        Args:
+            frames: Consecutive frames with their features, of which the last is the last keyframe.
+
+        Returns:
+            The views of those that could be localised, in order.
+        """
+        keyframes = self.map.keyframes
+        place = {keyframe.number: k for k, keyframe in enumerate(keyframes)}
+        first = next(i for i, frame in enumerate(frames) if frame.number in place)
+        views = list(self._earlier_views(frames[:first]))[::-1]
+        T = keyframes[0].T_camera_world
+        for frame in frames[first:]:
+            if frame.number in place:
+                T = keyframes[place[frame.number]].T_camera_world
+                views.append(self._view_of_keyframe(place[frame.number]))
+                continue
+            located = self._localised(frame, T)
+            if located is not None:
+                T = located.T_camera_world
+                views.append(self._view(located))
+        if views[-2].number == frames[-2].number:
+            self.motion = keyframes[-1].T_camera_world @ inverse_se3(self.pose(views[-2]))
+        return views
+
+    def _earlier_views(self, frames: Sequence[Frame]) -> Iterator[View]:
+        after = self.map.keyframes[0].frame()
+        for frame in reversed(frames):
+            frame.track(after)
+            located = self._localised(frame, after.T_camera_world)
+            if located is None:
+                return
+            located.append(*searched(self.map, located))
+            located = self._localised(located, located.T_camera_world)
+            if located is None:
+                return
+            after = located
+            yield self._view(located)
 
     def track(self, frame: Frame) -> View | None:
         """Localise the next frame, which may become a keyframe. None if that fails."""
@@ -120,50 +160,36 @@ class Tracking:
         """Whether a frame that cannot be tracked is compared with the keyframes, which is not done every time."""
         return self._lost_for <= EAGER or self._lost_for % LAZY == 0
 
-    def localised(self, frame: Frame, T_guess: NDArray[np.float64]) -> LocalisedFrame | None:
-        """Localise a frame by its features, without the outliers; None if too few landmarks agree.
-
-        Args:
-            frame: The frame.
-            T_guess: (4, 4) initial T_camera_world.
-        """
+    def _localised(self, frame: Frame, T_guess: NDArray[np.float64]) -> LocalisedFrame | None:
         return localised(self.map, frame, T_guess, self._seed)
 
-    def search(self, frame: LocalisedFrame) -> None:
-        """Add further landmarks of the map to the frame's features."""
-        frame.append(*searched(self.map, frame))
-
-    def view_of_keyframe(self, k: int) -> View:
-        """The view of keyframe k."""
+    def _view_of_keyframe(self, k: int) -> View:
         keyframe = self.map.keyframes[k]
         known = self.map.known[keyframe.ids]
         ids, pixels = keyframe.ids[known], keyframe.pixels[known]
-        return View(keyframe.number, keyframe, np.eye(4), ids, pixels, keyframe.scale)
+        return View(keyframe.number, keyframe.number, np.eye(4), ids, pixels, keyframe.scale)
 
-    def view(self, frame: LocalisedFrame) -> View:
+    def _view(self, frame: LocalisedFrame) -> View:
         """The view of a frame relative to the last keyframe before it, or to the first keyframe."""
-        k = max(0, bisect_right(self.map.keyframes, frame.number, key=lambda keyframe: keyframe.number) - 1)
-        keyframe = self.map.keyframes[k]
+        keyframe = self.map.keyframes[max(0, self.map.index(frame.number))]
         T = frame.T_camera_world @ inverse_se3(keyframe.T_camera_world)
         known = self.map.known[frame.ids]
-        return View(frame.number, keyframe, T, frame.ids[known], frame.pixels[known], keyframe.scale)
-
-    # ------------------------------------------------------------------------------------------------- following
+        return View(frame.number, keyframe.number, T, frame.ids[known], frame.pixels[known], keyframe.scale)
 
     def _follow(self, last: LocalisedFrame, frame: Frame) -> View | None:
         predicted = orthonormalised(self.motion @ last.T_camera_world)
         frame.track(last, predicted_pixels(self.map, last, predicted))
-        located = self.localised(frame, predicted)
+        located = self._localised(frame, predicted)
         if located is None:  # retry without the constant-velocity prediction
             frame.track(last)
-            located = self.localised(frame, last.T_camera_world)
+            located = self._localised(frame, last.T_camera_world)
         if located is None:
             return self._bridge(last, frame)
         self.motion = located.T_camera_world @ inverse_se3(last.T_camera_world)
         if self._wants_keyframe(located):
             return self._make_keyframe(located)
         self._last = located
-        view = self.view(located)
+        view = self._view(located)
         if self._wide_is_due:
             self._wide_is_due = False
             self._adjust_last(WIDE_WINDOW)
@@ -186,28 +212,28 @@ class Tracking:
     def _make_keyframe(self, frame: LocalisedFrame) -> View:
         """Make the last frame a keyframe: realign its landmarks, search for more, and adjust the map."""
         frame.pixels = realigned(self.map, frame)
-        self.search(frame)
-        return self._insert_keyframe(self.localised(frame, frame.T_camera_world) or frame)
+        frame.append(*searched(self.map, frame))
+        return self._insert_keyframe(self._localised(frame, frame.T_camera_world) or frame)
 
     def _insert_keyframe(self, frame: LocalisedFrame) -> View:
-        landmarks = self.map
-        rays = landmarks.lens.rays(frame.pixels)
-        keyframe = Keyframe(frame.number, frame.T_camera_world, frame.grey, frame.ids, frame.pixels, rays)
-        k = landmarks.add_keyframe(keyframe)
+        rays = self.map.lens.rays(frame.pixels)
+        k = self.map.add_keyframe(
+            Keyframe(frame.number, frame.T_camera_world, frame.grey, frame.ids, frame.pixels, rays)
+        )
         self._replenish(frame)
-        landmarks.triangulate(k)
+        self.map.triangulate(k)
         self._adjust()
+        keyframe = self.map.keyframes[k]
         still = np.isin(frame.ids, keyframe.ids)
-        frame.ids, frame.pixels = frame.ids[still], frame.pixels[still]
+        frame.ids, frame.pixels, frame.T_camera_world = frame.ids[still], frame.pixels[still], keyframe.T_camera_world
         self._last = frame
-        return self.view_of_keyframe(k)
+        return self._view_of_keyframe(k)
 
     def _replenish(self, frame: Frame) -> None:
         """Detect new corners in the frame of the last keyframe, and add them to both."""
         new = frame.new_corners()
         ids = self.map.new_ids(len(new))
-        self.map.keyframes[-1].append(ids, new, self.map.lens.rays(new))
-        self.map.note_observations(len(self.map.keyframes) - 1, ids, new)
+        self.map.observe(len(self.map.keyframes) - 1, ids, new)
         frame.append(ids, new)
 
     def _adjust(self) -> None:
@@ -231,42 +257,6 @@ class Tracking:
         self.map.adjust(free, held, steps=8)
         self.map.discard_outliers(free)
 
-    def refine_camera(self) -> None:
-        """Bundle adjust the whole map and the focal length, and with enough keyframes the distortion."""
-        assert self._refinement is not None, "the camera is known"
-        count = len(self.map.keyframes)
-        every = range(count)
-        with_distortion = count >= self._refinement.distortion_from
-        refined: list[Refinable] = ["focal", "distortion"] if with_distortion else ["focal"]
-        for _ in range(2):
-            self.map.adjust(every, steps=15, refined=refined)
-            self.map.discard_outliers(every)
-
-    @property
-    def camera_is_final(self) -> bool:
-        """Whether the camera is known, or has been refined for the last time."""
-        return self._refinement is None
-
-    def _refine_camera_in_use(self) -> None:
-        """Refine the camera, and undo that if the result is implausible. The last refinement makes it final."""
-        assert self._refinement is not None
-        before = self.map.copy()
-        self.refine_camera()
-        if not is_plausible(self.map.lens):
-            self.map.adopt(before)
-        if len(self.map.keyframes) >= self._refinement.at[-1]:
-            self._refinement = None
-
-    def relocalise(self, view: View) -> None:
-        """Refine the pose of an earlier view, after the map and its camera have changed."""
-        keyframe = view.keyframe
-        known = self.map.known[view.ids]
-        if view.number == keyframe.number or known.sum() < FEWEST:
-            return
-        rays = self.map.lens.rays(view.pixels[known])
-        T = refine_pose(self.pose(view), self.map.xyz[view.ids[known]], rays, SIGMA / self.map.lens.focal)
-        view.T_camera_keyframe, view.scale = T @ inverse_se3(keyframe.T_camera_world), keyframe.scale
-
     def _companions(self, free: list[int]) -> list[int]:
         """Other keyframes that share the most landmarks with `free`, at most HELD of them."""
         seen = np.zeros(len(self.map.known), dtype=bool)
@@ -274,35 +264,72 @@ class Tracking:
         others = [k for k in range(len(self.map.keyframes)) if k not in set(free)]
         shared = {k: int(seen[self.map.keyframes[k].ids].sum()) for k in others}
         closest = sorted(others, key=lambda k: (-shared[k], -k))[:HELD]
-        return sorted(k for k in closest if shared[k] >= 15)
+        return sorted(k for k in closest if shared[k] >= LEAST_SHARED)
 
-    # ------------------------------------------------------------------------------------------------- joining
+    # ------------------------------------------------------------------------------------------------- camera
 
-    def absorb(self, other: Tracking, S_self_other: NDArray[np.float64], follows: bool) -> int:
-        """Take over the map of another tracking.
+    @property
+    def camera_is_final(self) -> bool:
+        """Whether the camera is known, or has been refined for the last time."""
+        return self._refinement is None
+
+    def refine_camera(self) -> None:
+        """Bundle adjust the whole map and the focal length, and with enough keyframes the distortion."""
+        assert self._refinement is not None, "the camera is known"
+        every = range(len(self.map.keyframes))
+        with_distortion = len(every) >= self._refinement.distortion_from
+        refined: list[Refinable] = ["focal", "distortion"] if with_distortion else ["focal"]
+        for _ in range(2):
+            self.map.adjust(every, steps=15, refined=refined)
+            self.map.discard_outliers(every)
+
+    def _refine_camera_in_use(self) -> None:
+        """Refine the camera, and undo that if the result is implausible. The last refinement makes it final."""
+        assert self._refinement is not None
+        before = self.map.copy()
+        self.refine_camera()
+        if not self.map.lens.is_plausible:
+            self.map = before
+        if len(self.map.keyframes) >= self._refinement.at[-1]:
+            self._refinement = None
+
+    def relocalise(self, view: View) -> None:
+        """Refine the pose of an earlier view, after the map and its camera have changed."""
+        known = self.map.known[view.ids]
+        if view.number == view.keyframe or known.sum() < FEWEST:
+            return
+        keyframe = self.map.keyframes[self.map.index(view.keyframe)]
+        rays = self.map.lens.rays(view.pixels[known])
+        T = refine_pose(self.pose(view), self.map.xyz[view.ids[known]], rays, SIGMA / self.map.lens.focal)
+        view.T_camera_keyframe, view.scale = T @ inverse_se3(keyframe.T_camera_world), keyframe.scale
+
+    # ------------------------------------------------------------------------------------------------- other maps
+
+    def join(
+        self, other: Tracking, joint: LandmarkMap, offset: int, S_self_other: NDArray[np.float64], follows: bool
+    ) -> None:
+        """Continue with a map that joins this one with that of another tracking. The last frame is a keyframe.
 
         Args:
             other: The other tracking, which must not be used afterwards.
-            S_self_other: (4, 4) similarity from its world to this one.
-            follows: Whether to go on with the other's last frame.
-
-        Returns:
-            What the ids of the other map have grown by.
+            joint: The joint map.
+            offset: What the ids of the other map have grown by in it.
+            S_self_other: (4, 4) similarity from the other's world to this one.
+            follows: Whether the last frame is the other's.
         """
-        T = None if other._last is None else moved_pose(S_self_other, other._last.T_camera_world)
-        offset = self.map.absorb(other.map, S_self_other)
+        self.map = joint
         self._thumbnails = []
         self.recovered += other.recovered
+        for view in other.waiting:
+            view.ids = view.ids + offset
+        self.waiting += other.waiting
         if follows:
-            self._lost_for, self._last, self.motion = other._lost_for, other._last, other.motion.copy()
+            self._last, self.motion = other._last, other.motion.copy()
             self.motion[:3, 3] *= float(scale_of(S_self_other))
-            if self._last is not None:
-                assert T is not None
-                newest = self.map.keyframes[-1]
-                # A keyframe and its frame share their pose, so that the frame follows when the map is adjusted.
-                self._last.T_camera_world = newest.T_camera_world if newest.number == self._last.number else T
-                self._last.ids = self._last.ids + offset
-        return offset
+            assert self._last is not None
+            self._last.ids = self._last.ids + offset
+        assert self._last is not None
+        self._last.T_camera_world = joint.keyframes[-1].T_camera_world
 
     def follow_moves(self, moves: Sequence[NDArray[np.float64]]) -> None:
         """Note that the keyframes were moved by S_after_before (4, 4), when the last frame is a keyframe or the end."""
@@ -328,7 +355,8 @@ class Tracking:
         if len(frame.described.pixels) < FEWEST:
             return None
         self._thumbnails += [thumbnail(each.grey) for each in self.map.keyframes[len(self._thumbnails) :]]
-        alike = alike_keyframes(np.array(self._thumbnails), frame.grey, 3)
+        likeness = np.array(self._thumbnails) @ thumbnail(frame.grey)
+        alike = np.argsort(-likeness, kind="stable")[:ALIKE].tolist()
         view = self._placed(frame, dict.fromkeys([*alike, len(self.map.keyframes) - 1]))
         if view is not None:
             self.recovered += 1
@@ -342,9 +370,9 @@ class Tracking:
                 continue
             T, pairs = placed
             located = LocalisedFrame(frame.number, frame.grey, frame.valid, T_camera_world=T)
-            self.search(located)
+            located.append(*searched(self.map, located))
             located.append(*inherited(self.map, k, frame.described, pairs, T))
-            located = self.localised(located, T)
+            located = self._localised(located, T)
             if located is not None:
                 self.motion = np.eye(4)
                 return self._insert_keyframe(located)

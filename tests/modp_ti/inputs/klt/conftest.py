@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -52,6 +52,10 @@ class BoxRoom:
             seen = cv2.remap(texture, u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR)
             image[mine] = seen[mine]
         return image
+
+    def mirrored(self) -> BoxRoom:
+        """Another place."""
+        return replace(self, textures={wall: sheet[::-1].copy() for wall, sheet in self.textures.items()})
 
     def grey(self, T: NDArray[np.float64]) -> NDArray[np.uint8]:
         return cv2.cvtColor(self.image(T), cv2.COLOR_RGB2GRAY)
@@ -126,14 +130,20 @@ def box_walk(box_room: BoxRoom) -> Walk:
 BLACK = np.zeros((240, 320), np.uint8)
 
 
-def followed(box_room: BoxRoom, greys: Sequence[NDArray[np.uint8]], **settings: Any) -> Followed:
-    """Follow grey images with the known camera. No frame may come twice."""
-    odometry, views, brought = Odometry([Lens.pinhole(box_room.camera)], **settings), {}, []
+def followed(
+    box_room: BoxRoom,
+    greys: Sequence[NDArray[np.uint8]],
+    after: Callable[[int, Odometry], None] = lambda *_: None,
+    **settings: Any,
+) -> Followed:
+    """Follow grey images with the known camera, and call `after` with each number. No frame may come twice."""
+    odometry, views, brought = Odometry(Lens.pinhole(box_room.camera), **settings), {}, []
     for number in range(len(greys) + 1):
         found = odometry.process(number, greys[number]) if number < len(greys) else odometry.finish()
         brought.append([view.number for view in found])
         assert not set(brought[-1]) & set(views)
         views |= {view.number: view for view in found}
+        after(number, odometry)
     return Followed(odometry, views, brought)
 
 
@@ -147,12 +157,16 @@ class Followed:
 
     def errors(self, truth: Mapping[int, NDArray[np.float64]]) -> NDArray[np.float64]:
         """Distances [m] of camera centres from the true ones after the best similarity."""
-        estimate = camera_centres([self.views[i].T_camera_world for i in truth])
+        estimate = camera_centres([self.pose(i) for i in truth])
         target = camera_centres(list(truth.values()))
         s, R, t = umeyama(estimate, target)
         return np.linalg.norm(s * estimate @ R.T + t - target, axis=1)
 
+    def pose(self, number: int) -> NDArray[np.float64]:
+        assert self.odometry.tracking is not None
+        return self.odometry.tracking.pose(self.views[number])
+
     @property
     def poses(self) -> list[bytes]:
         """All poses, bit for bit."""
-        return [self.views[i].T_camera_world.tobytes() for i in sorted(self.views)]
+        return [self.pose(i).tobytes() for i in sorted(self.views)]

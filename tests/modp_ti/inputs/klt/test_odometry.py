@@ -1,4 +1,4 @@
-"""The odometry over made sequences with known poses: what it must follow, and what it must survive."""
+"""The odometry over made sequences with known poses: what it follows and survives, and how it joins maps."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tests.modp_ti.inputs.klt.conftest import BLACK, BoxRoom, Walk, followed
+from modp_ti.inputs.klt.map_joining import MapJoining
+from modp_ti.inputs.klt.recognition import Recognition
+from tests.modp_ti.inputs.klt.conftest import BLACK, BoxRoom, Walk, followed, turning_walk
 from tests.room import look_at
 
 pytestmark = pytest.mark.slow
@@ -107,10 +109,10 @@ def test_what_can_be_placed_is_placed_near_the_truth(box_room: BoxRoom, box_walk
     if name != "every_frame_of_a_walk":
         return
     assert found.odometry.tracking is not None
-    view, landmarks = found.views[50], found.odometry.tracking.map
+    view, landmarks, T = found.views[50], found.odometry.tracking.map, found.pose(50)
     known = landmarks.known[view.ids]
     assert known.sum() > 150
-    z = landmarks.xyz[view.ids[known]] @ view.T_camera_world[2, :3] + view.T_camera_world[2, 3]
+    z = landmarks.xyz[view.ids[known]] @ T[2, :3] + T[2, 3]
     ratio = z / box_room.depth(poses[50], view.pixels[known])
     assert np.median(np.abs(ratio / np.median(ratio) - 1)) < 0.01
     assert followed(box_room, greys[:35]).poses == followed(box_room, greys[:35]).poses
@@ -123,3 +125,55 @@ def test_pictures_without_parallax_or_texture_make_no_map(box_room: BoxRoom, of:
     greys = {"turns": [box_room.grey(T) for T in turns], "black": [BLACK] * 6, "grey": [BLACK + 90] * 6}[of]
     found = followed(box_room, greys)
     assert found.odometry.tracking is None and not found.views
+
+
+def test_a_map_begun_after_a_cut_is_joined_when_it_shows_the_first_ones_place(box_room, box_walk):
+    """It begins where the first one ended, and ends where that never was."""
+    there = turning_walk(60)
+    poses = [*there[:30], *[None] * 8, *box_walk.poses[:30], *there[:29:-1]]
+    found = followed(box_room, [BLACK if T is None else box_room.grey(T) for T in poses], begins_anew_after=5)
+    truth = {i: T for i, T in enumerate(poses) if T is not None}
+    assert found.odometry.joined == 1 and not found.odometry.waiting
+    assert sorted(found.views) == sorted(truth)
+    assert found.errors(truth).max() < 0.03
+    late = max(len(each) for each in found.brought[10:])
+    assert late >= 10, "the frames of the second map come when it is joined"
+
+
+def test_a_join_that_the_map_contradicts_leaves_both_maps_as_they_are(box_room, box_walk, monkeypatch):
+    """The second map, which has the larger part of the frames, is of another place."""
+    tried = []
+
+    def wrong(_, active, others):
+        if not others or len(active.map.keyframes) < 5 or tried:
+            return None
+        of, pairs = others[0].map.keyframes[0], np.c_[np.arange(40), np.arange(40)]
+        tried[:] = [Recognition(of, by, pairs, np.eye(4), of.T_camera_world, 1.0) for by in active.map.keyframes[-3:]]
+        return others[0], list(tried)
+
+    other = box_room.mirrored()
+    greys = [*box_walk.grey[:30], *[BLACK] * 8, *(other.grey(T) for T in box_walk.poses[:32])]
+    plain = followed(box_room, greys, begins_anew_after=5)
+    assert sorted(plain.views) == list(range(30)) and plain.odometry.waiting == [list(range(38, 70))]
+    assert (plain.odometry.joined, plain.odometry.undone) == (0, 0)
+    monkeypatch.setattr(MapJoining, "found", wrong)
+    contradicted = followed(box_room, greys, begins_anew_after=5)
+    assert tried and (contradicted.odometry.joined, contradicted.odometry.undone) == (0, 1)
+    assert (contradicted.poses, contradicted.odometry.waiting) == (plain.poses, plain.odometry.waiting)
+
+
+def test_the_largest_map_is_the_runs_if_the_first_is_lost_at_its_start(box_room, box_walk):
+    other = [np.ascontiguousarray(grey[::-1]) for grey in box_walk.grey[:9]]
+    found = followed(box_room, [*other, *[BLACK] * 8, *box_walk.grey[:40]], begins_anew_after=5)
+    assert sorted(found.views) == list(range(17, 57))
+    assert found.odometry.waiting == [list(range(9))]
+
+
+def test_only_the_first_frames_of_a_recording_wait_and_not_those_of_a_camera(box_room, box_walk):
+    """Both know their first map at the same frame. A recording has yet to see that it is no bad start."""
+    first = {}
+    for waits in (False, True):
+        found = followed(box_room, box_walk.grey[:40], begins_anew_after=5, waits=waits)
+        first[waits] = next(n for n, numbers in enumerate(found.brought) if numbers)
+        assert list(found.views) == list(range(40))
+    assert first[False] + 5 <= first[True] < 40

@@ -7,10 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from modp_ti.inputs.klt.frame import LocalisedFrame
 from modp_ti.inputs.klt.landmark_map import Keyframe, LandmarkMap
 from modp_ti.inputs.klt.localisation import searched
 from modp_ti.inputs.klt.recognition import (
+    AGREEING,
+    PAUSE,
     PlaceIndex,
     Recognition,
     agreeing,
@@ -27,9 +28,8 @@ ROUNDS = 2  # bundle adjustments, each without the outliers of the one before
 # of outliers after the adjustment.
 LARGEST_LOSS, LARGEST_DAMAGE = 0.5, 0.04
 CANDIDATES = 3  # keyframes of another map with which a keyframe is compared
-AGREEING = 3  # keyframes that must agree
-PAUSE = 5  # keyframes after a join that was refused in which none is sought
 MAX_ERROR = 5.0  # px
+MAX_ERROR_3D = 0.05  # of corresponding points, relative to their depth
 
 
 def connected(landmarks: LandmarkMap, found: Sequence[Recognition], apart: bool = False) -> bool:
@@ -44,8 +44,8 @@ def connected(landmarks: LandmarkMap, found: Sequence[Recognition], apart: bool 
         Whether the adjusted map agrees. If not, it is of no use.
     """
     every = range(len(landmarks.keyframes))
-    observed = _observations(landmarks)
-    made = connect(landmarks, found)
+    observed = len(landmarks.observations(every)[1])
+    made = [_connect(landmarks, each) for each in found]
     for _ in range(ROUNDS):
         if not np.isfinite(landmarks.adjust(every, steps=10, apart=apart)):
             return False
@@ -53,37 +53,20 @@ def connected(landmarks: LandmarkMap, found: Sequence[Recognition], apart: bool 
     kept = sum(int(np.isin(ids, keyframe.ids).sum()) for keyframe, ids in made)
     total = sum(len(ids) for _, ids in made)
     agree = total > 0 and kept >= (1.0 - LARGEST_LOSS) * total
-    return agree and _observations(landmarks) - kept >= (1.0 - LARGEST_DAMAGE) * observed
+    return agree and len(landmarks.observations(every)[1]) - kept >= (1.0 - LARGEST_DAMAGE) * observed
 
 
-def connect(landmarks: LandmarkMap, found: Sequence[Recognition]) -> list[tuple[Keyframe, NDArray[np.int64]]]:
-    """Let keyframes observe the landmarks of the keyframes that they recognise.
-
-    Returns:
-        The keyframes with the ids (N,) of the landmarks that they observe now.
-    """
-    place = {keyframe.number: k for k, keyframe in enumerate(landmarks.keyframes)}
-    made = []
-    for each in found:
-        of, by = place[each.of.number], place[each.by.number]
-        keyframe = landmarks.keyframes[by]
-        T = keyframe.T_camera_world
-        frame = LocalisedFrame(keyframe.number, keyframe.grey, None, keyframe.ids, keyframe.pixels, T_camera_world=T)
-        before = len(frame.ids)
-        frame.append(*inherited(landmarks, of, described_keyframe(keyframe), each.pairs, T))
-        frame.append(*searched(landmarks, frame))
-        ids, pixels = frame.ids[before:], frame.pixels[before:]
-        keyframe.append(ids, pixels, landmarks.lens.rays(pixels))
-        landmarks.note_observations(by, ids, pixels)
-        made.append((keyframe, ids[landmarks.known[ids]]))
-    return made
-
-
-def _observations(landmarks: LandmarkMap) -> int:
-    return sum(int(landmarks.known[keyframe.ids].sum()) for keyframe in landmarks.keyframes)
-
-
-MAX_ERROR_3D = 0.05  # of corresponding points, relative to their depth
+def _connect(landmarks: LandmarkMap, found: Recognition) -> tuple[Keyframe, NDArray[np.int64]]:
+    """Let a keyframe observe landmarks of the one that it recognises. Returns it and their ids (N,)."""
+    of, by = landmarks.index(found.of.number), landmarks.index(found.by.number)
+    keyframe = landmarks.keyframes[by]
+    frame = keyframe.frame()
+    before = len(frame.ids)
+    frame.append(*inherited(landmarks, of, described_keyframe(keyframe), found.pairs, frame.T_camera_world))
+    frame.append(*searched(landmarks, frame))
+    ids = frame.ids[before:]
+    landmarks.observe(by, ids, frame.pixels[before:])
+    return keyframe, ids[landmarks.known[ids]]
 
 
 class MapJoining:
@@ -113,10 +96,7 @@ class MapJoining:
         if self._pause is not None and active is self._pause[0] and len(active.map.keyframes) < self._pause[1]:
             return None
         candidates = [(other, keyframe) for other in others for keyframe in other.map.keyframes]
-        if not candidates:
-            return None
-        likeness = self._index.likeness(by, [keyframe for _, keyframe in candidates])
-        for at in np.argsort(-likeness, kind="stable")[:CANDIDATES]:
+        for at in self._index.alike(by, [keyframe for _, keyframe in candidates], CANDIDATES):
             other, of = candidates[at]
             recognition = recognised(other.map, of, active.map, by, self._seed)
             if recognition is None:
@@ -151,17 +131,18 @@ def joint_similarity(
     """
     from modp_ti.files.quiet_pycolmap import pycolmap
 
-    matched = [
-        (world_points(landmarks, each.of)[each.pairs[:, 0]], world_points(own, each.by)[each.pairs[:, 1]])
-        for each in found
-    ]
-    both = [np.isfinite(np.c_[there, here]).all(axis=1) for there, here in matched]
-    candidates = [each.S_of_by for each in found]
+    matched = []  # for each recognition, pairs of points in the two worlds, and the rays of `of` to them
+    for each in found:
+        a, b = each.pairs.T
+        there, here = world_points(landmarks, each.of)[a], world_points(own, each.by)[b]
+        good = np.isfinite(np.c_[there, here]).all(axis=1)
+        rays = landmarks.lens.rays(described_keyframe(each.of).pixels[a[good]])
+        matched.append((there[good], here[good], rays))
     options = pycolmap.RANSACOptions()
     options.max_error = MAX_ERROR_3D * float(np.median([each.depth for each in found]))
     options.random_seed = seed
-    there = np.concatenate([pair[0][good] for pair, good in zip(matched, both, strict=True)])
-    here = np.concatenate([pair[1][good] for pair, good in zip(matched, both, strict=True)])
+    there, here = (np.concatenate([each[i] for each in matched]) for i in range(2))
+    candidates = [each.S_of_by for each in found]
     together = estimated(pycolmap.estimate_sim3d_robust, here, there, options)
     if together is not None:
         # The declared type leaves out the dictionary around the transform.
@@ -170,9 +151,8 @@ def joint_similarity(
 
     def fitting(S: NDArray[np.float64]) -> int:
         count = 0
-        for each, (_, here), good in zip(found, matched, both, strict=True):
-            rays = landmarks.lens.rays(described_keyframe(each.of).pixels[each.pairs[good, 0]])
-            error = ray_errors(each.of.T_camera_world, here[good] @ S[:3, :3].T + S[:3, 3], rays)
+        for each, (_, here, rays) in zip(found, matched, strict=True):
+            error = ray_errors(each.of.T_camera_world, here @ S[:3, :3].T + S[:3, 3], rays)
             count += int((error * landmarks.lens.focal < MAX_ERROR).sum())
         return count
 
