@@ -113,7 +113,7 @@ def scene_extent(store: KeyframeStore) -> float:
     return max(1.1 * radius, LEAST_EXTENT * store.scene_depth)
 
 
-@in_engine("process", "initialise", "optimise", "finish", "caught", "compile")
+@in_engine("process", "initialise", "optimise", "finish", "compile")
 class OfflineMapper(Pipeline):
     """Offline 3DGS: collects all frames, then optimises Gaussians on one random view per step.
 
@@ -128,7 +128,7 @@ class OfflineMapper(Pipeline):
     """
 
     def __init__(self, settings: OfflineSettings, max_width: int, max_height: int, seed: int = 0) -> None:
-        self.settings = settings
+        self.settings: OfflineSettings = settings
         self.rng = np.random.default_rng(seed)
         self.stopwatch = Stopwatch()
         with settled(nodes=4) as self.tenancy:
@@ -142,19 +142,8 @@ class OfflineMapper(Pipeline):
         self.trajectory = Trajectory()
         self.keyframes = KeyframeStore(trajectory=self.trajectory)
 
-    @property
-    def near(self) -> float:
-        """Depth [scene units] below which nothing is drawn."""
-        return self.settings.near * self.keyframes.scene_depth
-
     def process(self, frame: TrackedFrame) -> FrameReport:
-        """Store the next frame.
-
-        Raises:
-            ValueError: If the frame is held out for evaluation.
-        """
-        if frame.held_out:
-            raise ValueError(f"frame {frame.index} is held out for evaluation and must not touch the map")
+        self._refuse_held_out(frame)
         self.keyframes.append(frame)
         return FrameReport(frame.index, True, len(self.keyframes), 0, None)
 
@@ -207,13 +196,6 @@ class OfflineMapper(Pipeline):
         except ValueError as error:
             raise NothingToMapError(str(error)) from None
         self.optimise(progress)
-
-    def caught(self) -> Safeguards:
-        """Return the safeguards' counts so far. Waits for the device."""
-        steps, exploded = self.gaussians.take_caught()
-        self.safeguards.gaussian_steps += steps
-        self.safeguards.exploded_gaussians += exploded
-        return self.safeguards
 
     def _rates(self, position_unit: float) -> LearningRates:
         s = self.settings

@@ -28,18 +28,16 @@ from pipelines.densify.depth.estimate import DepthEstimator
 from pipelines.densify.depth.sources import build_depth
 from pipelines.optimise.map_optimiser import MapOptimiser
 from pipelines.pipeline import FrameReport, Pipeline, Stopwatch
-from pipelines.refinement import finish
+from pipelines.refinement import finish, optimise_evenly
 from pipelines.render.renderer import Renderer
-from pipelines.safeguards import Safeguards
 from pipelines.select.gate import FrameGate
 from pipelines.select.keyframes import KeyframeSelector
-from pipelines.select.views import LocalGlobalViews, ViewSelection, global_probabilities
+from pipelines.select.views import LocalGlobalViews, ViewSelection
 from pipelines.settings import MappingSettings
 from pipelines.warm_up import warm_up
 
 
-@in_engine("compile", "process", "optimise", "optimise_further", "correct", "finish")
-@in_engine("prune", "all_gaussians", "begin_passes", "caught")
+@in_engine("compile", "process", "optimise", "optimise_further", "correct", "finish", "prune", "all_gaussians")
 class OnlineMapper(Pipeline):
     """Builds a Gaussian map from a stream of `TrackedFrame`s.
 
@@ -59,7 +57,7 @@ class OnlineMapper(Pipeline):
     Attributes:
         frame_count: Number of frames processed so far.
         settled: Number of views that `finish` has optimised since the last frame.
-        companions: Paging, places, hidden Gaussians, masks: what the loop calls at fixed places, in order.
+        companions: What the loop calls at fixed places, in order: exposure, paging, places, hidden Gaussians, masks.
 
     Example:
         mapper = modp_ti.OnlineMapper(modp_ti.MappingSettings(), max_width=640, max_height=480, seed=0)
@@ -78,47 +76,37 @@ class OnlineMapper(Pipeline):
         pace: Pace | None = None,
         folder: Path | None = None,
     ) -> None:
-        self.settings = settings
+        self.settings: MappingSettings = settings
         self.rng = np.random.default_rng(seed)
         self.stopwatch = Stopwatch()
+        self.frame_count = self.settled = 0
+        self.trajectory = Trajectory()
+        levels = settings.levels
+        self.keyframes = KeyframeStore(len(levels.probabilities), levels.min_side, self.trajectory)
         with settled(nodes=4 + SparseBricks.NODES) as self.tenancy:
             self.gaussians = GaussianField(settings.sh_degree, settings.max_gaussians)
             self.renderer = Renderer(self.gaussians, max_width, max_height, settings.image_cache)
-            self.companions: list[Companion] = []  # filled below: some need the optimiser
+            self.companions: list[Companion] = []  # filled below: they need the optimiser
             self.optimiser = MapOptimiser(self.gaussians, self.renderer, settings, self.companions)
-            self.loss = self.optimiser.loss
-            self.trajectory = Trajectory()
-            self.keyframes = KeyframeStore(
-                len(settings.levels.probabilities), settings.levels.min_side, self.trajectory
-            )
+            self.loss, self.safeguards = self.optimiser.loss, self.optimiser.safeguards
             self.gate = FrameGate(settings.gate, self.trajectory)
             self.selector = KeyframeSelector(settings.keyframes, self.trajectory)
             depth = depth or build_depth(settings.depth, self.renderer, settings.near, self.rng)
             self.densifier = Densifier(settings, self.optimiser, self.keyframes, depth, self.rng, self.stopwatch)
+            self.views = views or LocalGlobalViews(settings.views, self.rng)
+            self.pace = pace or CompletePace(settings)
             self.budget = self.densifier.budget
             self.paging = Paging(self.gaussians, self.keyframes, self.budget, settings, folder)
             contribution = Contribution(self.gaussians, self.renderer)
             self.hidden = HiddenGaussians(contribution, self.densifier, self.paging, settings.densify.min_contribution)
-            self.companions += [self.paging, OtherPlaces(self.densifier), self.hidden]
+            self.companions += [self.optimiser.exposure, self.paging, OtherPlaces(self.densifier), self.hidden]
             if settings.transients:
                 self.transients = TransientSweep(self.gaussians, self.keyframes, self.renderer, self.paging)
                 self.companions.append(self.transients)
-            self.pace = pace or CompletePace(settings)
-            self.views = views or LocalGlobalViews(settings.views, self.rng)
             self.corrector = MapCorrector(self.keyframes, self.densifier, self.paging)
-        self.frame_count = self.settled = 0
-
-    def compile(self) -> None:
-        warm_up(self)
 
     def process(self, frame: TrackedFrame) -> FrameReport:
-        """Process the next frame.
-
-        Raises:
-            ValueError: If the frame is held out for evaluation.
-        """
-        if frame.held_out:
-            raise ValueError(f"frame {frame.index} is held out for evaluation and must not touch the map")
+        self._refuse_held_out(frame)
         self.frame_count += 1
         self.settled = 0
         self.trajectory.add(frame)
@@ -127,44 +115,25 @@ class OnlineMapper(Pipeline):
         with self.stopwatch.measure("select"):
             last = next(iter(self.keyframes.before(frame.index, 1)), None)
             if self.gate.refuses(frame, last, self.renderer, self.near):
-                return FrameReport(frame.index, False, len(self.keyframes.selected), self.gaussian_count, None)
+                return self._report(frame)
             is_wanted = self.selector.is_keyframe(frame, last) and self.pace.takes_keyframe()
             for companion in self.companions:
                 companion.before_frame(frame, is_wanted)
             is_keyframe = is_wanted and self.budget.takes_keyframe(frame)
-        psnr, steps = None, 0
         if is_keyframe:
-            psnr, steps = self._add_keyframe(frame)
-        elif len(self.keyframes):
-            # Other frames only add their tracked points, at a pose corrected by the neighbouring keyframes. Some
-            # become views: the more directions the map is optimised from, the better it looks from new ones.
-            if self.selector.is_between(frame, self.keyframes) and self.budget.takes_between(frame):
-                view = self._append(frame, is_between=True)
-            else:
-                view = self.keyframes.view(frame)
-            self.densifier.add_tracked_points(view)
-            if is_wanted:
-                # The budget has no room for this keyframe, so the existing ones are optimised instead. Far from them,
-                # every frame is selected as a keyframe; each therefore gets only 1 / max_gap of the steps.
-                steps = -(-self.pace.plan(0, *self.counts).steps // self.settings.keyframes.max_gap)
-                psnr = self._optimise_evenly(self.paging.near(), steps, self.settings.views.per_step)
-        return FrameReport(frame.index, is_keyframe, len(self.keyframes.selected), self.gaussian_count, psnr, steps)
+            return self._add_keyframe(frame)
+        return self._add_points(frame, is_wanted) if len(self.keyframes) else self._report(frame)
 
-    def _append(self, frame: TrackedFrame, is_between: bool = False) -> Keyframe:
-        """Add a frame to the views of the map."""
-        view = self.keyframes.append(frame, is_between)
-        for companion in self.companions:
-            companion.after_view(len(self.keyframes) - 1)
-        return view
-
-    def _add_keyframe(self, frame: TrackedFrame) -> tuple[float | None, int]:
-        """Add a keyframe, add Gaussians from it, and optimise. Returns the last step's mean PSNR, and the steps."""
+    def _add_keyframe(self, frame: TrackedFrame) -> FrameReport:
+        """Add a keyframe, add Gaussians from it, and optimise."""
         view = self._append(frame)
         if len(self.keyframes) > 1 and self.settings.poses.enabled and self.settings.poses.align:
             self.optimiser.poses.align(view)
         with self.stopwatch.measure("optimise"):
-            self.optimiser.exposure.begin(self.keyframes, self.renderer, self.near)
-        level = self._draw_level(view)
+            for companion in self.companions:
+                companion.new_keyframe(self.keyframes, self.renderer, self.near)
+        p = np.array(self.settings.levels.probabilities[: len(view.pyramid)])
+        level = int(self.rng.choice(len(p), p=p / p.sum()))
         plan = self.pace.plan(level, *self.counts)
         image = view.at_level(level)
         self.densifier.add_tracked_points(image)
@@ -175,12 +144,37 @@ class OnlineMapper(Pipeline):
         with self.stopwatch.measure("remove"):
             for companion in self.companions:
                 companion.after_keyframe(self.near, plan.swept)
-        return psnr, plan.steps
+        return self._report(frame, True, psnr, plan.steps)
 
-    def _draw_level(self, view: Keyframe) -> int:
-        """Draw the pyramid level of a new keyframe from the levels that its image has."""
-        p = np.array(self.settings.levels.probabilities[: len(view.pyramid)])
-        return int(self.rng.choice(len(p), p=p / p.sum()))
+    def _add_points(self, frame: TrackedFrame, is_wanted: bool) -> FrameReport:
+        """Add the tracked points of another frame, at a pose corrected by the neighbouring keyframes.
+
+        Some frames become views: the more directions the map is optimised from, the better it looks from new ones.
+        """
+        if self.selector.is_between(frame, self.keyframes) and self.budget.takes_between(frame):
+            view = self._append(frame, is_between=True)
+        else:
+            view = self.keyframes.view(frame)
+        self.densifier.add_tracked_points(view)
+        if not is_wanted:
+            return self._report(frame)
+        # The budget has no room for this keyframe, so the existing ones are optimised instead. Far from them, every
+        # frame is selected as a keyframe; each therefore gets only 1 / max_gap of the steps.
+        steps = -(-self.pace.plan(0, *self.counts).steps // self.settings.keyframes.max_gap)
+        psnr = optimise_evenly(self, self.paging.near(), steps, self.settings.views.per_step)
+        return self._report(frame, False, psnr, steps)
+
+    def _append(self, frame: TrackedFrame, is_between: bool = False) -> Keyframe:
+        view = self.keyframes.append(frame, is_between)
+        for companion in self.companions:
+            companion.after_view(len(self.keyframes) - 1)
+        return view
+
+    def _report(
+        self, frame: TrackedFrame, is_keyframe: bool = False, psnr: float | None = None, steps: int = 0
+    ) -> FrameReport:
+        keyframes = len(self.keyframes.selected)
+        return FrameReport(frame.index, is_keyframe, keyframes, self.gaussian_count, psnr, steps)
 
     def optimise(self, steps: int, level: int = 0) -> float | None:
         """Optimise the map on the last keyframe and the views selected with it.
@@ -201,29 +195,10 @@ class OnlineMapper(Pipeline):
             with self.stopwatch.measure("select"):
                 views = self.views.select(self.keyframes)
             with self.stopwatch.measure("optimise"):
-                self.optimiser.step(
-                    self.keyframes,
-                    views,
-                    self.optimiser.rates(self.keyframes.scene_depth),
-                    pose_rate=poses.learning_rate if poses.enabled and step < poses.steps else 0.0,
-                    level=level,
-                )
-        with self.stopwatch.measure("optimise"):
-            return self.optimiser.settle() if steps > 0 else None
-
-    def _optimise_evenly(self, among: NDArray[np.int64], steps: int, views: int) -> float | None:
-        """Optimise the map, but no poses, on `views` keyframes per step, drawn from `among` (N,) by error alone.
-
-        Returns the mean PSNR of the last step.
-        """
-        if len(self.gaussians) == 0 or len(among) == 0:
-            return None
-        with self.stopwatch.measure("optimise"):
-            for _ in range(steps):
-                p = global_probabilities(self.keyframes, self.settings.views.error_weight, 0.0, among)
-                batch = [int(j) for j in self.rng.choice(among, views, p=p / p.sum())]
                 rates = self.optimiser.rates(self.keyframes.scene_depth)
-                self.optimiser.step(self.keyframes, batch, rates, pose_rate=0.0)
+                pose_rate = poses.learning_rate if poses.enabled and step < poses.steps else 0.0
+                self.optimiser.step(self.keyframes, views, rates, pose_rate, level)
+        with self.stopwatch.measure("optimise"):
             return self.optimiser.settle() if steps > 0 else None
 
     def optimise_further(self) -> float | None:
@@ -234,7 +209,7 @@ class OnlineMapper(Pipeline):
         """
         if len(self.keyframes) == 0:
             return None
-        return self._optimise_evenly(self.paging.near(), 1, self.settings.views.global_views)
+        return optimise_evenly(self, self.paging.near(), 1, self.settings.views.global_views)
 
     def correct(self, correction: PoseCorrection, more: bool = False) -> CorrectionReport:
         """Apply poses and points that the tracker has revised, see `MapCorrector`.
@@ -247,16 +222,18 @@ class OnlineMapper(Pipeline):
             around, moved = self.corrector.correct(correction, settings, more)
         if len(moved):
             seen = np.intersect1d(moved, self.paging.near())
-            self._optimise_evenly(seen, self.pace.steps_after_correction(*self.counts), settings.views)
+            optimise_evenly(self, seen, self.pace.steps_after_correction(*self.counts), settings.views)
         return CorrectionReport(around, moved=len(moved) > 0)
 
     def finish(self, progress: Callable[[int, int, float], None] | None = None) -> float | None:
         return finish(self, progress)
 
-    @property
-    def near(self) -> float:
-        """Depth [scene units] below which nothing is drawn."""
-        return self.settings.near * self.keyframes.scene_depth
+    def prune(self) -> int:
+        """Remove Gaussians whose opacity is below `densify.prune_opacity`. Returns their number."""
+        return self.gaussians.remove(self.gaussians.opacities() >= self.settings.densify.prune_opacity)
+
+    def compile(self) -> None:
+        warm_up(self)
 
     @property
     def counts(self) -> tuple[int, int]:
@@ -269,28 +246,6 @@ class OnlineMapper(Pipeline):
 
     def all_gaussians(self) -> dict[str, NDArray]:
         return self.paging.to_numpy()
-
-    def prune(self) -> int:
-        """Remove Gaussians whose opacity is below `densify.prune_opacity`.
-
-        Returns:
-            Number of Gaussians removed.
-        """
-        return self.gaussians.remove(self.gaussians.opacities() >= self.settings.densify.prune_opacity)
-
-    def begin_passes(self, places: NDArray[np.int64]) -> None:
-        """Let the companions look at keyframes before passes over them, see `Companion.before_passes`.
-
-        Args:
-            places: Places (N,) of the keyframes in the store.
-        """
-        with self.stopwatch.measure("remove"):
-            for companion in self.companions:
-                companion.before_passes(places, self.near)
-
-    def caught(self) -> Safeguards:
-        """Return the safeguards' counts so far. Waits for the device."""
-        return self.optimiser.caught()
 
     @property
     def refused(self) -> Mapping[str, int]:

@@ -7,9 +7,11 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from numpy.typing import NDArray
+
+from fields.runtime.tenancy import in_engine
 
 if TYPE_CHECKING:
     from fields.frames.pose_correction import PoseCorrection
@@ -50,26 +52,31 @@ class FrameReport:
     steps: int = 0
 
 
+@in_engine("caught")
 class Pipeline(ABC):
     """Builds a map of Gaussians from frames that are processed one by one.
 
     What only the online mapper does has defaults here, for `OfflineMapper`: it rejects no frame and has no budget.
+
+    Attributes:
+        transients: Masks what moves; None if it is not masked.
     """
 
+    settings: Any
     gaussians: GaussianField
     keyframes: KeyframeStore
     trajectory: Trajectory
     renderer: Renderer
     loss: PhotometricLoss
+    safeguards: Safeguards
     stopwatch: Stopwatch
     tenancy: Tenancy
     transients: TransientSweep | None = None
-    """Masks what moves; None if it is not masked."""
 
     @property
-    @abstractmethod
     def near(self) -> float:
         """Depth [scene units] below which nothing is drawn."""
+        return self.settings.near * self.keyframes.scene_depth
 
     @property
     def gaussian_count(self) -> int:
@@ -92,6 +99,10 @@ class Pipeline(ABC):
             ValueError: If the frame is held out for evaluation.
         """
 
+    def _refuse_held_out(self, frame: TrackedFrame) -> None:
+        if frame.held_out:
+            raise ValueError(f"frame {frame.index} is held out for evaluation and must not touch the map")
+
     @abstractmethod
     def correct(self, correction: PoseCorrection, more: bool = False) -> CorrectionReport:
         """Apply poses and points that the tracker has revised.
@@ -112,9 +123,12 @@ class Pipeline(ABC):
             NothingToMapError: If there are no points to start from.
         """
 
-    @abstractmethod
     def caught(self) -> Safeguards:
         """Return the safeguards' counts so far. Waits for the device."""
+        steps, exploded = self.gaussians.take_caught()
+        self.safeguards.gaussian_steps += steps
+        self.safeguards.exploded_gaussians += exploded
+        return self.safeguards
 
     @property
     def refused(self) -> Mapping[str, int]:

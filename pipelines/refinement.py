@@ -45,6 +45,36 @@ class LastPart:
     before: int
 
 
+def optimise_evenly(mapper: OnlineMapper, among: NDArray[np.int64], steps: int, views: int) -> float | None:
+    """Optimise a map, but no poses, on keyframes that are drawn by error alone.
+
+    Args:
+        mapper: The mapper.
+        among: Places (N,) of the keyframes in the store.
+        steps: Number of steps.
+        views: Number of keyframes per step.
+
+    Returns:
+        Mean PSNR of the last step; None if nothing was optimised.
+    """
+    if len(mapper.gaussians) == 0 or len(among) == 0:
+        return None
+    store, optimiser = mapper.keyframes, mapper.optimiser
+    with mapper.stopwatch.measure("optimise"):
+        for _ in range(steps):
+            p = global_probabilities(store, mapper.settings.views.error_weight, 0.0, among)
+            batch = [int(j) for j in mapper.rng.choice(among, views, p=p / p.sum())]
+            optimiser.step(store, batch, optimiser.rates(store.scene_depth), pose_rate=0.0)
+        return optimiser.settle() if steps > 0 else None
+
+
+def _begin_passes(mapper: OnlineMapper, places: NDArray[np.int64]) -> None:
+    """Let the companions look at keyframes before passes over them."""
+    with mapper.stopwatch.measure("remove"):
+        for companion in mapper.companions:
+            companion.before_passes(places, mapper.near)
+
+
 def finish(mapper: OnlineMapper, progress: Callable[[int, int, float], None] | None = None) -> float | None:
     """Finish the map after the last frame: passes over all keyframes, then a final pruning.
 
@@ -90,7 +120,7 @@ def _settle(
     """Make a part of the passes of `finish`."""
     places, store, optimiser = part.places, mapper.keyframes, mapper.optimiser
     if mapper.settled == part.first:
-        mapper.begin_passes(places)
+        _begin_passes(mapper, places)
     views = np.resize(places[np.argsort(places * GOLDEN_RATIO % 1.0)], part.end - part.first)
     count, psnr = mapper.settings.views.per_step, None
     while mapper.settled < part.end:
@@ -174,7 +204,7 @@ def refine(
         step, share = done, schedule(done)
         removes = settings.min_contribution > 0 and not (by_the_clock and len(store) > MOST_SWEPT)
         if not done and share is not None:
-            mapper.begin_passes(np.arange(len(store)))
+            _begin_passes(mapper, np.arange(len(store)))
         if removes and not done and share is not None:
             with mapper.stopwatch.measure("refine"):
                 mapper.hidden.remove(settings.min_contribution, mapper.near)

@@ -87,7 +87,7 @@ def save_state(mapper: OnlineMapper) -> MapState:
         "view_renders": mapper.renderer.view_renders,
         "random": mapper.rng.bit_generator.state,
         "gate": mapper.gate.state(),
-        "guards": mapper.optimiser.caught().counts(),
+        "guards": mapper.caught().counts(),
     }
     if voxels is not None:
         groups["voxels"] = dict(zip(("places", "words", "resting"), voxels.marks(), strict=True))

@@ -35,7 +35,7 @@ def warm_up(mapper: OnlineMapper) -> None:
             voxels.query(np.zeros((0, 3)), 1.0)
             voxels.admit(np.zeros((0, 3)), 1.0)
         grow(gaussians, tracked_seeds(view), None, 1.0, settings.densify, mapper.budget)
-        optimiser.exposure.begin(store, renderer, settings.near)
+        optimiser.exposure.new_keyframe(store, renderer, settings.near)
         if settings.exposure.enabled:
             first.exposure = view.exposure = np.array(IDENTITY)
         optimiser.step(store, [1], optimiser.rates(1.0), pose_rate=0.0)

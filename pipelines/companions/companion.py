@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 
 from fields.frames.tracked_frame import TrackedFrame
 from fields.map.keyframe import Keyframe
+from fields.map.keyframes import KeyframeStore
+from pipelines.render.renderer import Renderer
 
 
 class Companion:
@@ -28,6 +30,15 @@ class Companion:
 
     def after_view(self, place: int) -> None:
         """Called when a frame has become a view of the map, at this place in the store."""
+
+    def new_keyframe(self, store: KeyframeStore, renderer: Renderer, near: float) -> None:
+        """Called with each new keyframe, the last of the store, after its pose is aligned and before it adds Gaussians.
+
+        Args:
+            store: The keyframes.
+            renderer: Renderer of the map. Its images may be overwritten.
+            near: Depth below which nothing is drawn [scene units].
+        """
 
     def before_step(self) -> None:
         """Called before each optimisation step."""

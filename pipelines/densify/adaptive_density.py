@@ -13,7 +13,7 @@ from fields.buffers.view import ProjectedGaussians, ViewField
 from fields.map.gaussians import SH_C0, GaussianField
 from fields.map.keyframe import Keyframe
 from fields.runtime.engine import ti
-from pipelines.optimise.exposure import scene_colours
+from pipelines.companions.exposure import scene_colours
 from pipelines.settings import OfflineSettings
 
 # A split divides the scales of a Gaussian by this factor.

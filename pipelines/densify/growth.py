@@ -13,8 +13,8 @@ from fields.geometry.se3 import inverse_se3
 from fields.map.gaussians import NO_ANCHOR, SH_C0, GaussianField
 from fields.map.keyframe import Keyframe
 from fields.voxels.occupancy import OccupancyVoxels
+from pipelines.companions.exposure import scene_colours
 from pipelines.densify.depth.estimate import DepthEstimator, misplacement
-from pipelines.optimise.exposure import scene_colours
 from pipelines.safeguards import MemoryBudget
 from pipelines.settings import DensifySettings
 

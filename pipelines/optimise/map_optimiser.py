@@ -14,8 +14,8 @@ from fields.map.keyframe import Keyframe
 from fields.map.keyframes import KeyframeStore
 from fields.runtime.compiled_kernel import AsyncReadback
 from pipelines.companions.companion import Companion
+from pipelines.companions.exposure import ExposureRefinement
 from pipelines.optimise.adam import Adam, LearningRates
-from pipelines.optimise.exposure import ExposureRefinement
 from pipelines.optimise.gpu_losses import photometric_loss
 from pipelines.optimise.losses import AspectPenalty, LossValues
 from pipelines.optimise.poses import PoseRefinement
@@ -140,13 +140,6 @@ class MapOptimiser:
             self._read(self._unread.popleft())
         self._move()
         return self._psnr
-
-    def caught(self) -> Safeguards:
-        """Return the safeguards' counts so far. Waits for the device."""
-        steps, exploded = self.gaussians.take_caught()
-        self.safeguards.gaussian_steps += steps
-        self.safeguards.exploded_gaussians += exploded
-        return self.safeguards
 
     def _read(self, seen: list[tuple[Keyframe, LossValues]]) -> None:
         """Apply the loss values of a step's views."""

@@ -11,8 +11,8 @@ from fields.geometry.se3 import exp_se3, log_se3, orthonormalised
 from fields.map.keyframe import Keyframe
 from fields.map.keyframes import KeyframeStore
 from fields.runtime.tenancy import in_engine
+from pipelines.companions.exposure import MIN_OPACITY, MIN_PIXELS, fitted_gains
 from pipelines.optimise.adam import Moments
-from pipelines.optimise.exposure import MIN_OPACITY, MIN_PIXELS, fitted_gains
 from pipelines.optimise.gpu_losses import photometric_loss
 from pipelines.render.renderer import Renderer
 from pipelines.safeguards import Safeguards

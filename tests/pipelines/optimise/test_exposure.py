@@ -14,8 +14,8 @@ from fields.frames.tracked_frame import TrackedFrame
 from fields.map.keyframe import Keyframe
 from fields.map.keyframes import KeyframeStore
 from fields.runtime.backend import initialise
+from pipelines.companions.exposure import CHANGED, ExposureRefinement, fitted_gains, light_changes, scene_colours
 from pipelines.online import OnlineMapper
-from pipelines.optimise.exposure import CHANGED, ExposureRefinement, fitted_gains, light_changes, scene_colours
 from pipelines.render.cpu.photometric_model import IDENTITY
 from pipelines.settings import ExposureSettings, MappingSettings
 from tests.pipelines.wall import CAMERA, frame
@@ -123,7 +123,7 @@ def test_a_keyframe_that_sees_nothing_of_the_map_begins_anew_only_at_a_place_of_
 ) -> None:
     """If no id ever returns, none tells of a new place."""
     store = keyframes(ids, EXPOSURE, EXPOSURE, EXPOSURE)
-    ExposureRefinement(ExposureSettings(enabled=enabled)).begin(store, showing(share=0.0), 0.01)
+    ExposureRefinement(ExposureSettings(enabled=enabled)).new_keyframe(store, showing(share=0.0), 0.01)
     np.testing.assert_array_equal(store[-1].exposure, begins_with if own else EXPOSURE)
     assert (store[-1].index in store.begins) == own
 
@@ -131,7 +131,7 @@ def test_a_keyframe_that_sees_nothing_of_the_map_begins_anew_only_at_a_place_of_
 @pytest.mark.parametrize(("share", "own"), [(0.1, True), (0.5, False)])
 def test_fringes_of_an_earlier_place_are_no_return_to_it(share: float, own: bool) -> None:
     store = keyframes((0, 0, 2), EXPOSURE, EXPOSURE, EXPOSURE)
-    ExposureRefinement(ExposureSettings(enabled=True)).begin(store, showing(share), 0.01)
+    ExposureRefinement(ExposureSettings(enabled=True)).new_keyframe(store, showing(share), 0.01)
     assert (store[-1].index in store.begins) == own
 
 
@@ -145,7 +145,7 @@ def test_exposures_of_a_new_place_are_estimated_once_its_light_changes() -> None
         if index < 2:
             store[index].exposure = EXPOSURE
         else:
-            refinement.begin(store, showing(share), 0.01)
+            refinement.new_keyframe(store, showing(share), 0.01)
         if index == 3:
             assert [view.exposure is None for view in store] == [False, False, True, True]
     assert [view.index in store.begins for view in store] == [False, False, True, False, False]
@@ -160,7 +160,7 @@ def test_back_at_an_earlier_place_exposures_are_estimated_if_they_were_there(est
     """Ten keyframes lie between, and none of them tracks a point of the first or the last."""
     store = keyframes((0, *[1] * 10, 0), EXPOSURE if estimated_there else None, *[None] * 11)
     store.begins.add(store[1].index)
-    ExposureRefinement(ExposureSettings(enabled="auto")).begin(store, showing(1.0), 0.01)
+    ExposureRefinement(ExposureSettings(enabled="auto")).new_keyframe(store, showing(1.0), 0.01)
     assert [view.index in store.begins for view in store] == [False, True, *[False] * 10]
     assert [view.exposure is not None for view in store] == [estimated_there] * 12
 

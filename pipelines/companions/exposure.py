@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from fields.map.keyframe import Keyframe
 from fields.map.keyframes import KeyframeStore
+from pipelines.companions.companion import Companion
 from pipelines.optimise.adam import Moments
 from pipelines.render.cpu.photometric_model import IDENTITY
 from pipelines.render.renderer import Renderer
@@ -150,7 +151,7 @@ def _is_elsewhere(store: KeyframeStore) -> bool:
     return len(latest) > 0 and len(np.unique(known)) < len(known) and not np.isin(latest, known).any()
 
 
-class ExposureRefinement:
+class ExposureRefinement(Companion):
     """Adam on the exposure (A, b) of keyframes. New keyframes start from a fit to the map.
 
     Attributes:
@@ -168,7 +169,7 @@ class ExposureRefinement:
         self.safeguards = Safeguards() if safeguards is None else safeguards
         self.moments = Moments(3, 4)
 
-    def begin(self, store: KeyframeStore, renderer: Renderer, near: float) -> None:
+    def new_keyframe(self, store: KeyframeStore, renderer: Renderer, near: float) -> None:
         """Initialise the exposure of the latest keyframe by a fit of gains to the current render, if enabled.
 
         With `enabled: auto`, exposures are estimated from the first keyframe on whose light has changed, see
@@ -178,11 +179,6 @@ class ExposureRefinement:
         and so do those after it: the brightness of that place is free, and exposures that were estimated at once would
         all rise while its Gaussians are young and too dark. Back at an earlier place, they are estimated again. That a
         place begins is noted without exposures as well.
-
-        Args:
-            store: The keyframes.
-            renderer: Renderer of the map. Its images are overwritten.
-            near: Depth below which nothing is drawn [scene units].
         """
         view, enabled = store[-1], self.settings.enabled
         unestimated = np.array(IDENTITY) if enabled is True else None
