@@ -18,10 +18,9 @@ from fields.runtime.tenancy import in_engine, settled
 from pipelines.corrections import CorrectionReport, revise
 from pipelines.densify.adaptive_density import AdaptiveDensity, initialise, union_of_points
 from pipelines.optimise.adam import Adam, LearningRates
-from pipelines.optimise.gpu_losses import photometric_loss
-from pipelines.optimise.losses import LossValues
 from pipelines.pipeline import FrameReport, NothingToMapError, Pipeline, Stopwatch
 from pipelines.refinement import decay
+from pipelines.render.formulas import LossValues
 from pipelines.render.renderer import Renderer
 from pipelines.safeguards import EXPLODED, Safeguards
 from pipelines.settings import OfflineSettings
@@ -134,7 +133,7 @@ class OfflineMapper(Pipeline):
         with settled(nodes=4) as self.tenancy:
             self.gaussians = GaussianField(settings.sh_degree, settings.max_gaussians)
             self.renderer = Renderer(self.gaussians, max_width, max_height, settings.image_cache)
-            self.loss = photometric_loss(self.renderer.images)
+            self.loss = self.renderer.loss
             self._last: LossValues | None = None
             self.adam = Adam(self.gaussians)
             self.safeguards = Safeguards()

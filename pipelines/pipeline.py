@@ -22,8 +22,7 @@ if TYPE_CHECKING:
     from fields.runtime.tenancy import Tenancy
     from pipelines.companions.transients import TransientSweep
     from pipelines.corrections import CorrectionReport
-    from pipelines.optimise.losses import PhotometricLoss
-    from pipelines.render.renderer import Renderer
+    from pipelines.render.renderer import LossStage, Renderer
     from pipelines.safeguards import Safeguards
 
 
@@ -67,7 +66,7 @@ class Pipeline(ABC):
     keyframes: KeyframeStore
     trajectory: Trajectory
     renderer: Renderer
-    loss: PhotometricLoss
+    loss: LossStage
     safeguards: Safeguards
     stopwatch: Stopwatch
     tenancy: Tenancy

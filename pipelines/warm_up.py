@@ -10,7 +10,7 @@ from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from fields.map.keyframes import KeyframeStore
 from pipelines.densify.growth import grow, tracked_seeds
-from pipelines.render.cpu.photometric_model import IDENTITY
+from pipelines.render.formulas import IDENTITY
 
 if TYPE_CHECKING:
     from pipelines.online import OnlineMapper

@@ -31,8 +31,8 @@ STAGES = (
 # the exponential:
 FORWARD_FLOPS = 34
 BACKWARD_FLOPS = 54
-# Per pixel and channel in pipelines/optimise/losses.py: five windows of 11 + 11 taps (including the products), SSIM and
-# its derivatives, three windows of 11 + 11 taps, the gradient.
+# Per pixel and channel in pipelines/render/cpu/losses.py: five windows of 11 + 11 taps (including the products), SSIM
+# and its derivatives, three windows of 11 + 11 taps, the gradient.
 LOSS_FLOPS = 110 + 110 + 45 + 132 + 10
 # Bytes per Gaussian that Adam updates: 14 float32 with gradient and two moments, and two counters, each read and
 # written.

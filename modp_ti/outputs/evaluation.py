@@ -25,8 +25,8 @@ from pipelines.companions.transients import (
     soft_mask,
     without,
 )
-from pipelines.optimise.losses import LossValues
 from pipelines.pipeline import Pipeline
+from pipelines.render.formulas import LossValues
 from pipelines.render.renderer import RenderedView
 from pipelines.whole.hierarchy import ShownMap
 

@@ -10,7 +10,7 @@ from fields.map.keyframe import Keyframe
 from fields.map.keyframes import KeyframeStore
 from pipelines.companions.companion import Companion
 from pipelines.optimise.adam import Moments
-from pipelines.render.cpu.photometric_model import IDENTITY
+from pipelines.render.formulas import IDENTITY
 from pipelines.render.renderer import Renderer
 from pipelines.safeguards import Safeguards
 from pipelines.settings import ExposureSettings

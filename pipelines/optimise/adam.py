@@ -1,5 +1,5 @@
 """Adam over the Gaussians that the last batch of views saw, and over small vectors of keyframes."""
-# pyright: reportInvalidTypeForm=false, reportOptionalCall=false, reportOptionalSubscript=false
+# pyright: reportIndexIssue=false, reportInvalidTypeForm=false, reportOptionalCall=false, reportOptionalSubscript=false
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -167,6 +167,47 @@ class Adam:
         for k in range(active):
             total += ti.abs(g.sh.grad[i, k]).sum()
         return _bits(total)
+
+
+@ti.data_oriented
+class AspectPenalty:
+    """Penalty on Gaussians with an aspect ratio above 10:1 (the paper's supplementary settings).
+
+    The penalty is weight / N * sum over the touched Gaussians of max(0, s_max - 10 s_min)^2, with scales s in scene
+    depths.
+    """
+
+    def __init__(self, gaussians: GaussianField, max_ratio: float = 10.0) -> None:
+        self.gaussians = gaussians
+        self.max_ratio = max_ratio
+        self._add = CompiledLoop(self._backward, 20)
+
+    def backward(self, weight: float, scene_depth: float) -> None:
+        """Add the gradient of the penalty to the gradients of the log-scales.
+
+        Args:
+            weight: Weight of the penalty.
+            scene_depth: Depth of the scene [scene units].
+        """
+        count = self.gaussians.count
+        if count:
+            self._add(count, count, weight / count, 1.0 / float(scene_depth))
+
+    @ti.kernel
+    def _backward(self, alone: ti.template(), count: ti.i32, weight: ti.f64, per_depth: ti.f64):
+        ti.loop_config(serialize=alone)
+        for i in range(count):
+            if self.gaussians.touched[i] != 0:
+                scale = ti.exp(self.gaussians.log_scale[i]) * ti.cast(per_depth, self.gaussians.real)
+                longest, shortest = scale.max(), scale.min()
+                excess = longest - self.max_ratio * shortest
+                if excess > 0.0:
+                    pull = 2.0 * ti.cast(weight, self.gaussians.real) * excess
+                    for c in ti.static(range(3)):
+                        is_longest = ti.cast(scale[c] == longest, self.gaussians.real)
+                        is_shortest = ti.cast(scale[c] == shortest, self.gaussians.real)
+                        gradient = pull * scale[c] * (is_longest - self.max_ratio * is_shortest)
+                        self.gaussians.log_scale.grad[i][c] = self.gaussians.log_scale.grad[i][c] + gradient
 
 
 class Moments:

@@ -15,10 +15,9 @@ from fields.map.keyframes import KeyframeStore
 from fields.runtime.compiled_kernel import AsyncReadback
 from pipelines.companions.companion import Companion
 from pipelines.companions.exposure import ExposureRefinement
-from pipelines.optimise.adam import Adam, LearningRates
-from pipelines.optimise.gpu_losses import photometric_loss
-from pipelines.optimise.losses import AspectPenalty, LossValues
+from pipelines.optimise.adam import Adam, AspectPenalty, LearningRates
 from pipelines.optimise.poses import PoseRefinement
+from pipelines.render.formulas import LossValues
 from pipelines.render.renderer import Renderer
 from pipelines.safeguards import EXPLODED, Safeguards
 from pipelines.settings import MappingSettings
@@ -44,7 +43,7 @@ class MapOptimiser:
         self.gaussians = gaussians
         self.renderer = renderer
         self.settings = settings
-        self.loss = photometric_loss(renderer.images)
+        self.loss = renderer.loss
         self.aspect = AspectPenalty(gaussians)
         self.adam = Adam(gaussians)
         self.safeguards = Safeguards()

@@ -13,7 +13,6 @@ from fields.map.keyframes import KeyframeStore
 from fields.runtime.tenancy import in_engine
 from pipelines.companions.exposure import MIN_OPACITY, MIN_PIXELS, fitted_gains
 from pipelines.optimise.adam import Moments
-from pipelines.optimise.gpu_losses import photometric_loss
 from pipelines.render.renderer import Renderer
 from pipelines.safeguards import Safeguards
 
@@ -143,7 +142,7 @@ class ViewAlignment:
         self.renderer = renderer
         self.tenancy = renderer.tenancy
         self.near = near
-        self.loss = photometric_loss(renderer.images)
+        self.loss = renderer.loss
 
     def refine(
         self,

@@ -8,8 +8,8 @@ The tests compare the two implementations, and `scripts/benchmark` prints the ra
 from fields.buffers.images import PAD
 from fields.buffers.tiles import TILE_HEIGHT, TILE_WIDTH
 from fields.runtime.engine import ti
-from pipelines.render.cpu.compositing import ALPHA_MAX, OPAQUE, Compositing
-from pipelines.render.cpu.projection import ALPHA_MIN
+from pipelines.render.cpu.compositing import Compositing
+from pipelines.render.formulas import ALPHA_MAX, ALPHA_MIN, OPAQUE
 
 
 @ti.data_oriented
@@ -17,15 +17,9 @@ class ReferenceCompositing(Compositing):
     """Drop-in replacement for `Compositing`, without the gradient of depth."""
 
     def forward(self) -> None:
-        """Fill `images.colour`, `.depth` and `.opacity`."""
         self._forward_pixels(self.view.width, self.view.height)
 
     def backward(self, with_depth: bool = False) -> None:
-        """Propagate `images.colour_grad` and `.opacity_grad` to the gradients in `projected`.
-
-        Raises:
-            NotImplementedError: If `with_depth` is set.
-        """
         if with_depth:
             raise NotImplementedError("the reference has no gradient of depth")
         self._clear(self.projected.count)

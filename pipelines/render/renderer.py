@@ -18,16 +18,53 @@ from fields.runtime.engine import ti
 from fields.runtime.tenancy import in_engine, settled
 from pipelines.render.cpu.binning import CHUNKS, Binning
 from pipelines.render.cpu.compositing import Compositing
-from pipelines.render.cpu.photometric_model import PhotometricModel
+from pipelines.render.cpu.losses import PhotometricLoss
+from pipelines.render.cpu.photometric import Photometric
 from pipelines.render.cpu.projection import Projection
+from pipelines.render.formulas import LossValues
 from pipelines.render.gpu.binning import DeviceBinning
 from pipelines.render.gpu.compositing import DeviceCompositing
-from pipelines.render.gpu.photometric_model import DevicePhotometricModel
+from pipelines.render.gpu.losses import DevicePhotometricLoss
+from pipelines.render.gpu.photometric import DevicePhotometric
 from pipelines.render.gpu.projection import DeviceProjection
 
 
+class ProjectionStage(Protocol):
+    """Culls, sorts and projects the Gaussians into `projected`, for the view in `view`."""
+
+    def forward(self) -> int:
+        """Fill `projected`, and return the number of visible Gaussians; on a GPU, an upper bound of it."""
+        ...
+
+    def backward(self) -> None:
+        """Propagate the gradients in `projected` to the Gaussians and to the camera tangents."""
+
+    def camera_gradient(self) -> np.ndarray:
+        """Return d loss / d xi (6,) of the view's T_camera_world, summed in a fixed order."""
+        ...
+
+    def async_camera_gradient(self) -> AsyncReadback:
+        """Return `camera_gradient` as an asynchronous copy. On the CPU, there is nothing to wait for."""
+        ...
+
+
+class BinningStage(Protocol):
+    """Fills the tile pairs from `projected`."""
+
+    def forward(self, exact: bool = True) -> None:
+        """Bin the projected Gaussians.
+
+        Args:
+            exact: On a GPU, wait for the number of pairs, and make room for all of them. Otherwise the room follows
+                from earlier views, and pairs beyond it are dropped.
+
+        Raises:
+            ValueError: If there are more pairs than there is room for; on a GPU, if `exact`.
+        """
+
+
 class CompositingStage(Protocol):
-    """Protocol of compositing on the CPU and on a GPU."""
+    """Composites `projected` into `images`, and propagates gradients back."""
 
     def forward(self) -> None:
         """Fill `images.colour`, `.depth` and `.opacity`."""
@@ -36,11 +73,85 @@ class CompositingStage(Protocol):
         """Propagate `images.*_grad`, with or without `images.depth_grad`, to the gradients in `projected`."""
 
 
-class BinningStage(Protocol):
-    """Protocol of binning on the CPU and on a GPU."""
+class PhotometricStage(Protocol):
+    """Applies exposure and vignette to `images.colour` in place, and propagates `images.colour_grad` back."""
 
-    def forward(self, exact: bool = True) -> object:
-        """Bin the projected Gaussians of the current view; see `Renderer.forward` for `exact`."""
+    def forward(self, exposure: np.ndarray | None, vignette: np.ndarray | None) -> None:
+        """Apply exposure and vignette to the last rendered image.
+
+        Args:
+            exposure: Exposure (A, b) (3, 4); None for the identity.
+            vignette: Vignette (H, W, 3) at the camera's full size, which is resized to the image; None for none.
+        """
+
+    def backward(self) -> None:
+        """Propagate `images.colour_grad` back to the render, and restore the render in `images.colour`."""
+
+    def exposure_gradient(self) -> np.ndarray:
+        """Return d loss / d (A, b) (3, 4) of the last image, after `backward`."""
+        ...
+
+    def async_exposure_gradient(self) -> AsyncReadback:
+        """Return `exposure_gradient` as an asynchronous copy. On the CPU, there is nothing to wait for."""
+        ...
+
+
+class LossStage(Protocol):
+    """Compares `images.colour` with `images.reference` at the pixels of `images.valid`.
+
+    Attributes:
+        lag: Number of steps after which the values should be read, so that the host does not wait: 0 on the CPU, where
+            they are available at once.
+    """
+
+    lag: int
+
+    def forward(self) -> LossValues:
+        """Evaluate the loss, and write the SSIM map to `images.ssim`.
+
+        Masked pixels of the render are replaced by the reference, so that they do not affect any window. On a GPU, the
+        values wait for the device when they are read.
+        """
+        ...
+
+    def send(self) -> None:
+        """Start the asynchronous copy of the values so far to the host."""
+
+    def backward(self, ssim_weight: float, scale: float = 1.0) -> None:
+        """Fill `images.colour_grad` with scale * d loss / d colour, loss = (1 - w) L1 + w (1 - SSIM).
+
+        Args:
+            ssim_weight: Weight w of 1 - SSIM.
+            scale: Factor on the gradient.
+        """
+
+
+Stages = tuple[ProjectionStage, BinningStage, CompositingStage, PhotometricStage, LossStage]
+
+
+def make_stages(
+    gaussians: GaussianField,
+    view: ViewField,
+    projected: ProjectedGaussians,
+    pairs: TilePairs | DevicePairs,
+    images: ImageBuffers,
+) -> Stages:
+    """Make the stages of a renderer in the form of the running device, which is that of `pairs`."""
+    if isinstance(pairs, DevicePairs):
+        return (
+            DeviceProjection(gaussians, view, projected),
+            DeviceBinning(view, projected, pairs),
+            DeviceCompositing(view, projected, pairs, images),
+            DevicePhotometric(images),
+            DevicePhotometricLoss(images),
+        )
+    return (
+        Projection(gaussians, view, projected),
+        Binning(view, projected, pairs),
+        Compositing(view, projected, pairs, images),
+        Photometric(images),
+        PhotometricLoss(images),
+    )
 
 
 @dataclass(frozen=True)
@@ -77,6 +188,7 @@ class Renderer:
 
     Attributes:
         images: Image buffers.
+        loss: Compares the rendered image with the reference image.
         view_renders: Number of views rendered and differentiated so far, the measure of work in comparisons of the
             online and offline modes.
 
@@ -97,22 +209,12 @@ class Renderer:
             self.view = ViewField(builder, real)
             self.projected = ProjectedGaussians(builder, gaussians.capacity, real)
             self.images = ImageBuffers(builder, max_width, max_height, real, image_cache_gb)
-            self.projection: Projection
-            self.binning: BinningStage
-            self.compositing: CompositingStage
-            self.photometric_model: PhotometricModel
             if on_gpu():
-                self.pairs = pairs = DevicePairs(builder, max_width, max_height)
-                self.projection = DeviceProjection(gaussians, self.view, self.projected)
-                self.binning = DeviceBinning(self.view, self.projected, pairs)
-                self.compositing = DeviceCompositing(self.view, self.projected, pairs, self.images)
-                self.photometric_model = DevicePhotometricModel(self.images)
+                self.pairs = DevicePairs(builder, max_width, max_height)
             else:
-                self.pairs = pairs = TilePairs(builder, self.images.max_tiles, CHUNKS, real=real)
-                self.projection = Projection(gaussians, self.view, self.projected)
-                self.binning = Binning(self.view, self.projected, pairs)
-                self.compositing = Compositing(self.view, self.projected, pairs, self.images)
-                self.photometric_model = PhotometricModel(self.images)
+                self.pairs = TilePairs(builder, self.images.max_tiles, CHUNKS, real=real)
+            stages = make_stages(gaussians, self.view, self.projected, self.pairs, self.images)
+            self.projection, self.binning, self.compositing, self.photometric, self.loss = stages
             builder.finalize()
             refuse_too_many_fields(self.pairs.last_placed)
         self.view_renders = 0
@@ -141,7 +243,7 @@ class Renderer:
             exposure: Exposure (A, b) (3, 4); None for the identity.
             vignette: Vignette (H, W, 3); None for no vignetting.
         """
-        self.photometric_model.forward(exposure, vignette)
+        self.photometric.forward(exposure, vignette)
 
     def backward(
         self, with_depth: bool = False, observe: Callable[[ProjectedGaussians, ViewField], None] | None = None
@@ -153,7 +255,7 @@ class Renderer:
             observe: Called with the gradients of the projected Gaussians, before projection's backward pass overwrites
                 them.
         """
-        self.photometric_model.backward()
+        self.photometric.backward()
         self.compositing.backward(with_depth)
         if observe is not None:
             observe(self.projected, self.view)
@@ -170,11 +272,11 @@ class Renderer:
 
     def exposure_gradient(self) -> np.ndarray:
         """Return d loss / d exposure (3, 4) of the last rendered image. Call it after `backward`."""
-        return self.photometric_model.exposure_gradient()
+        return self.photometric.exposure_gradient()
 
     def async_exposure_gradient(self) -> AsyncReadback:
         """Return `exposure_gradient` as an asynchronous copy, without waiting for the device."""
-        return self.photometric_model.async_exposure_gradient()
+        return self.photometric.async_exposure_gradient()
 
     def render(
         self,

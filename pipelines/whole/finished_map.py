@@ -14,7 +14,7 @@ from fields.map.keyframe import Keyframe
 from fields.map.keyframes import KeyframeStore
 from pipelines.densify.densifier import Anchor
 from pipelines.online import OnlineMapper
-from pipelines.render.cpu.photometric_model import IDENTITY
+from pipelines.render.formulas import IDENTITY
 
 
 @dataclass(frozen=True)

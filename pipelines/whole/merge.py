@@ -17,7 +17,7 @@ from fields.geometry.camera import PinholeCamera
 from fields.map.gaussians import SH_C0
 from fields.runtime.engine import ti
 from pipelines.online import OnlineMapper
-from pipelines.render.cpu.photometric_model import IDENTITY
+from pipelines.render.formulas import IDENTITY
 from pipelines.render.renderer import Renderer
 from pipelines.whole.finished_map import FinishedMap, take_in_frames, take_in_gaussians
 

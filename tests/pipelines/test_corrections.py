@@ -14,7 +14,7 @@ from fields.runtime.backend import initialise
 from pipelines.corrections import WorldMotion, motion_in_pixels, revise
 from pipelines.offline import OfflineMapper
 from pipelines.online import OnlineMapper
-from pipelines.render.cpu.projection import ALPHA_MIN
+from pipelines.render.formulas import ALPHA_MIN
 from pipelines.settings import MappingSettings, OfflineSettings
 from tests.pipelines.wall import CAMERA, NORMAL, OFFSET, frame, pose
 

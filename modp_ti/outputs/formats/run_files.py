@@ -31,7 +31,7 @@ from modp_ti.outputs.evaluation import FrameScore, MapVersion
 from modp_ti.outputs.formats.dataset import write_colmap
 from modp_ti.outputs.formats.splats_ply import write_splats
 from modp_ti.outputs.formats.trajectory import write_trajectory
-from pipelines.render.cpu.photometric_model import IDENTITY
+from pipelines.render.formulas import IDENTITY
 
 NOT_ALWAYS = ("colmap", "exposure.json", "masks")
 """What `write_map` writes that another map may lack, or have other files in."""

@@ -13,7 +13,6 @@ from modp_ti.outputs.playback.finished_run import FinishedRun
 from modp_ti.outputs.playback.map_renderer import MapRenderer
 from modp_ti.outputs.progress import ProgressLine
 from pipelines.optimise.adam import Adam, LearningRates
-from pipelines.optimise.gpu_losses import photometric_loss
 
 # Maximum number of views to fit, evenly spaced over the frames.
 VIEWS = 60
@@ -52,7 +51,7 @@ def with_plain_colours(run: FinishedRun, line: ProgressLine) -> dict[str, NDArra
         picture = maps.picture(camera, T)
         views.append((camera, T, np.dstack([picture, np.full(picture.shape[:2], 255, np.uint8)])))
     gaussians, renderer = maps.renderer.gaussians, maps.renderer
-    adam, loss = Adam(gaussians), photometric_loss(renderer.images)
+    adam, loss = Adam(gaussians), renderer.loss
     make_plain(gaussians.sh, len(gaussians), gaussians.sh_count)
     rates = asdict(replace(RATES, position=RATES.position * run.record.scene_depth))
     rng = np.random.default_rng(0)

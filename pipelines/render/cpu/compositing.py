@@ -15,11 +15,8 @@ from fields.buffers.tiles import GROUP, TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, Ti
 from fields.buffers.view import ProjectedGaussians, ViewField
 from fields.runtime.compiled_kernel import HANDED_OUT, CompiledKernel, CompiledLoop
 from fields.runtime.engine import ti
-from pipelines.render.cpu.projection import ALPHA_MIN
+from pipelines.render.formulas import ALPHA_MAX, ALPHA_MIN, OPAQUE
 
-ALPHA_MAX = 0.99
-# A tile stops once the transmittance is below this at all of its pixels, which affects neither 8 bits nor the tests.
-OPAQUE = 1e-5
 # Lower bound of the transmittance: far below what is visible, and above denormal numbers, which are slow.
 LEAST_TRANSMITTANCE = 1e-20
 ROW_BITS = TILE_WIDTH.bit_length() - 1
@@ -41,15 +38,9 @@ class Compositing:
         self._differentiate = {False: CompiledKernel(self._backward), True: CompiledKernel(self._backward_with_depth)}
 
     def forward(self) -> None:
-        """Fill `images.colour`, `.depth` and `.opacity`."""
         self._composite(self.view.width, self.view.height)
 
     def backward(self, with_depth: bool = False) -> None:
-        """Propagate `images.*_grad` to the gradients in `projected`.
-
-        Args:
-            with_depth: Also propagate `images.depth_grad`.
-        """
         self._differentiate[with_depth](self.view.width, self.view.height)
         self._add_up(self.projected.count, self.projected.count)
 

@@ -13,22 +13,12 @@ import numpy as np
 import torch
 
 from fields.buffers.view import ProjectedGaussians, ViewField
-from fields.geometry.vec3 import cross, dot, rotate, rotate_back, rotation_from_quaternion
-from fields.map.gaussians import SH_C0, GaussianField
+from fields.map.gaussians import GaussianField
 from fields.runtime.compiled_kernel import HANDED_OUT, AsyncReadback, CompiledLoop
 from fields.runtime.engine import ti
-from pipelines.render.spherical_harmonics import add_sh_gradient, evaluate_sh
+from pipelines.render.formulas import ProjectionFormulas
+from pipelines.render.spherical_harmonics import add_sh_gradient
 
-# Variance of the pixel's footprint, added to every ellipse [px^2].
-BLUR = 0.3
-# Contributions below this are not drawn, as in other splatting renderers.
-ALPHA_MIN = 1.0 / 255.0
-MIN_LOGIT = float(np.log(ALPHA_MIN / (1.0 - ALPHA_MIN)))
-# Distance from the centre of an opaque Gaussian at which its contribution falls to ALPHA_MIN [standard deviations].
-MAX_REACH = float(np.sqrt(-2.0 * np.log(ALPHA_MIN)))
-# Lower bound of the compensation's determinant ratio. Below it, a Gaussian is far thinner than a pixel, and the
-# gradient would be infinite.
-MIN_DETERMINANT_RATIO = 1e-6
 # Time of a Gaussian on one thread, for harmonics of degree 0 to 3 [ns].
 PROJECT, PROJECT_BACK, BEGIN_BACK = (43, 48, 57, 67), (100, 107, 121, 136), (7, 12, 20, 33)
 CHUNK = 512
@@ -37,14 +27,11 @@ SPREAD = HANDED_OUT // 2
 
 
 @ti.data_oriented
-class Projection:
+class Projection(ProjectionFormulas):
     """Culls, sorts and projects `gaussians` into `projected`, for the view in `view`."""
 
     def __init__(self, gaussians: GaussianField, view: ViewField, projected: ProjectedGaussians) -> None:
-        self.gaussians = gaussians
-        self.view = view
-        self.projected = projected
-        self.tangent = gaussians.tangent
+        super().__init__(gaussians, view, projected, gaussians.tangent)
         self._keys = np.zeros(1, dtype=np.uint64)
         self._depths = np.zeros(1, dtype=np.float32)
         self._chunk_counts = np.zeros(1, dtype=np.int32)
@@ -58,11 +45,6 @@ class Projection:
         self._begin_back = CompiledLoop(self._begin_gradients, BEGIN_BACK[degree])
 
     def forward(self) -> int:
-        """Fill `projected` for the current view.
-
-        Returns:
-            Number of visible Gaussians.
-        """
         self._all = n = self.gaussians.count
         self.projected.count = count = self._visible()
         if count:
@@ -76,14 +58,12 @@ class Projection:
         return count
 
     def backward(self) -> None:
-        """Propagate the gradients in `projected` to the Gaussians and to their camera tangents."""
         count = self.projected.count
         if count:
             self._begin_back(count, self._all)
             self._project_back(count, self._all)
 
     def camera_gradient(self) -> np.ndarray:
-        """Return d loss / d xi (6,) of the view's T_camera_world, summed in a fixed order."""
         count = self.projected.count
         chunks = -(-count // CHUNK)
         partial = np.zeros((chunks, 6), dtype=np.float64)
@@ -92,7 +72,6 @@ class Projection:
         return partial.sum(axis=0)
 
     def async_camera_gradient(self) -> AsyncReadback:
-        """Return `camera_gradient` with the interface of the GPU. On the CPU, there is nothing to wait for."""
         return AsyncReadback(torch.from_numpy(self.camera_gradient()))
 
     # ---- which, and in which order ---------------------------------------------------------------------------
@@ -131,38 +110,6 @@ class Projection:
             depths[i] = depth
             seen += ti.cast(depth > 0.0, ti.i32)
         counts[chunk] = seen
-
-    @ti.func
-    def _camera(self):
-        """The view's T_camera_world (3, 4), and an upper bound on the stretch of its linearised projection."""
-        rotation, translation = self.view.rotation[None], self.view.translation[None]
-        focal, limits = self.view.focal[None], self.view.limits[None]
-        camera = ti.Matrix.zero(self.projected.real, 3, 4)
-        for r in ti.static(range(3)):
-            for c in ti.static(range(3)):
-                camera[r, c] = rotation[r, c]
-            camera[r, 3] = translation[r]
-        # |rows of J| <= f / z * sqrt(1 + limit^2).
-        bound = ti.max(ti.max(-limits[0], limits[1]), ti.max(-limits[2], limits[3]))
-        return camera, ti.max(focal[0], focal[1]) * ti.sqrt(1.0 + bound * bound)
-
-    @ti.func
-    def _seen_at(self, i, camera, stretch):
-        """Depth (float32) of Gaussian i if the view may see it, else 0. camera, stretch: from `_camera`."""
-        focal, centre, size = self.view.focal[None], self.view.centre[None], self.view.size[None]
-        position = self.gaussians.position[i]
-        p = camera @ ti.Vector([position[0], position[1], position[2], ti.cast(1.0, self.projected.real)])
-        visible = 0
-        if p.z > self.view.near[None] and self.gaussians.opacity_logit[i] > MIN_LOGIT:
-            inv_z = 1.0 / p.z
-            sigma = ti.exp(self.gaussians.log_scale[i].max()) * stretch * inv_z
-            # The reach of an opaque Gaussian: the exact one would cost an exponential and a logarithm more.
-            radius = MAX_REACH * ti.sqrt(sigma * sigma + BLUR)
-            x = focal[0] * p.x * inv_z + centre[0]
-            y = focal[1] * p.y * inv_z + centre[1]
-            if x + radius > 0.0 and x - radius < size[0] and y + radius > 0.0 and y - radius < size[1]:
-                visible = 1
-        return ti.select(visible == 1, ti.cast(p.z, ti.f32), 0.0)
 
     @ti.kernel
     def _compact_chunks(
@@ -212,60 +159,6 @@ class Projection:
             if s >= 0:
                 self._project_one(i, s, i)
                 self._shade_one(i, s, i)
-
-    @ti.func
-    def _project_one(self, i, s, t):
-        """Project Gaussian i to slot s, with the camera tangent t."""
-        xi = self.tangent[t]
-        rho, omega = ti.Vector([xi[0], xi[1], xi[2]]), ti.Vector([xi[3], xi[4], xi[5]])
-        W = self.view.rotation[None]
-        focal, limits = self.view.focal[None], self.view.limits[None]
-
-        # exp(xi) to first order, whose value and derivative are exact at xi = 0.
-        tracked = rotate(W, self.gaussians.position[i]) + self.view.translation[None]
-        p = tracked + cross(omega, tracked) + rho
-        inv_z = 1.0 / p[2]
-        tx, ty = p[0] * inv_z, p[1] * inv_z
-        # Rows of the Jacobian of the pixel position, linearised inside the frustum's margin.
-        jx = -ti.min(ti.max(tx, limits[0]), limits[1])
-        jy = -ti.min(ti.max(ty, limits[2]), limits[3])
-        row_x = ti.Vector([1.0, 0.0, jx]) * (focal[0] * inv_z)
-        row_y = ti.Vector([0.0, 1.0, jy]) * (focal[1] * inv_z)
-        # u, v: rows of J exp(omega) W R S, since row . (a + omega x a) = (row + row x omega) . a
-        R = rotation_from_quaternion(self.gaussians.quaternion[i])
-        scale = ti.exp(self.gaussians.log_scale[i])
-        u = rotate_back(R, rotate_back(W, row_x + cross(row_x, omega))) * scale
-        v = rotate_back(R, rotate_back(W, row_y + cross(row_y, omega))) * scale
-
-        sharp_xx, sharp_xy, sharp_yy = dot(u, u), dot(u, v), dot(v, v)
-        minors = cross(u, v)
-        # Cauchy-Binet avoids the cancellation of xx * yy - xy^2, which would leave only rounding for needles.
-        sharp_determinant = dot(minors, minors)
-        determinant = sharp_determinant + BLUR * (sharp_xx + sharp_yy) + BLUR * BLUR
-        compensation = ti.sqrt(ti.max(sharp_determinant / determinant, MIN_DETERMINANT_RATIO))
-
-        self.projected.mean[s] = ti.Vector([focal[0] * tx, focal[1] * ty]) + self.view.centre[None]
-        self.projected.conic[s] = ti.Vector([sharp_yy + BLUR, -sharp_xy, sharp_xx + BLUR]) / determinant
-        self.projected.depth[s] = p[2]
-        self.projected.opacity[s] = compensation / (1.0 + ti.exp(-self.gaussians.opacity_logit[i]))
-
-    @ti.func
-    def _shade_one(self, i, s, t):
-        """Compute the colour of Gaussian i in slot s, with the camera tangent t."""
-        if ti.static(self.gaussians.sh_degree == 0):
-            self.projected.colour[s] = ti.max(0.5 + SH_C0 * self.gaussians.sh[i, 0], 0.0)
-        else:
-            colour = evaluate_sh(ti.static(self.gaussians.sh_degree), self.gaussians.sh, i, self._direction(i, t))
-            self.projected.colour[s] = ti.max(0.5 + colour, 0.0)
-
-    @ti.func
-    def _direction(self, i, t):
-        """Unit vector (3) from the camera to Gaussian i in the world frame, with the camera tangent t."""
-        xi = self.tangent[t]
-        # Rotating a camera does not move its centre, so only rho changes the direction: W'(p + rho).
-        tracked = rotate(self.view.rotation[None], self.gaussians.position[i]) + self.view.translation[None]
-        ray = rotate_back(self.view.rotation[None], tracked + ti.Vector([xi[0], xi[1], xi[2]]))
-        return ray / ti.sqrt(dot(ray, ray))
 
     @ti.kernel
     def _begin_gradients(self, alone: ti.template(), n: ti.i32):

@@ -10,7 +10,7 @@ from fields.buffers.view import ProjectedGaussians, ViewField
 from fields.runtime.backend import torch_device
 from fields.runtime.compiled_kernel import AsyncReadback, CompiledKernel
 from fields.runtime.engine import ti
-from pipelines.render.cpu.binning import Binning
+from pipelines.render.formulas import EllipseFormulas
 
 # The room for pairs is MARGIN times the largest total of the last MEMORY views. A view with more pairs loses its
 # farthest ones.
@@ -20,14 +20,13 @@ PATIENCE = 2
 
 
 @ti.data_oriented
-class DeviceBinning(Binning):
+class DeviceBinning(EllipseFormulas):
     """Fills `pairs` from `projected` for the view in `view`; see `Binning`."""
 
     tile_width, tile_height = TILE_WIDTH, TILE_HEIGHT
 
     def __init__(self, view: ViewField, projected: ProjectedGaussians, pairs: DevicePairs) -> None:
-        self.view = view
-        self.projected = projected
+        super().__init__(view, projected)
         self.pairs = pairs
         self._count_tiles, self._emit_pairs = CompiledKernel(self._count_all), CompiledKernel(self._emit)
         self._arrange_pairs = CompiledKernel(self._arrange)
@@ -36,15 +35,6 @@ class DeviceBinning(Binning):
         self._counts = torch.empty(0, dtype=torch.int32, device=torch_device())
 
     def forward(self, exact: bool = True) -> None:
-        """Bin the projected Gaussians of the current view.
-
-        Args:
-            exact: Wait for the number of pairs, and make room for all of them. Otherwise the room follows from earlier
-                views, and pairs beyond it are dropped.
-
-        Raises:
-            ValueError: If `exact` and there are more than `max_pairs` pairs.
-        """
         tiles_x = -(-self.view.width // TILE_WIDTH)
         tiles_y = -(-self.view.height // TILE_HEIGHT)
         n, pairs = self.projected.count, self.pairs

@@ -13,8 +13,7 @@ from fields.buffers.images import PAD, ImageBuffers
 from fields.buffers.view import ProjectedGaussians, ViewField
 from fields.runtime.compiled_kernel import CompiledKernel
 from fields.runtime.engine import ti
-from pipelines.render.cpu.compositing import ALPHA_MAX, OPAQUE
-from pipelines.render.cpu.projection import ALPHA_MIN
+from pipelines.render.formulas import ALPHA_MAX, ALPHA_MIN, OPAQUE
 from pipelines.render.gpu.compositing_gradient import (
     COLUMNS,
     ROW_BITS,
@@ -55,17 +54,11 @@ class DeviceCompositing:
         self._no_indices = torch.zeros(1, dtype=torch.int32, device=pairs.device)
 
     def forward(self) -> None:
-        """Fill `images.colour`, `.depth` and `.opacity`."""
         pairs, any_pairs = self.pairs, self.pairs.capacity > 0
         slot, rows = (pairs.slot, pairs.rows) if any_pairs else (self._no_indices, self._no_indices)
         self._composite(self.view.width, self.view.height, slot, rows)
 
     def backward(self, with_depth: bool = False) -> None:
-        """Propagate `images.*_grad` to the gradients in `projected`.
-
-        Args:
-            with_depth: Also propagate `images.depth_grad`.
-        """
         pairs = self.pairs
         if self.projected.count:
             width, height = self.view.width, self.view.height

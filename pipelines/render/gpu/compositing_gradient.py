@@ -12,8 +12,7 @@ reduction over the warps, and the order of the sums is fixed.
 
 from fields.buffers.device_pairs import TILE_PIXELS, TILE_WIDTH
 from fields.runtime.engine import ti
-from pipelines.render.cpu.compositing import ALPHA_MAX, OPAQUE
-from pipelines.render.cpu.projection import ALPHA_MIN
+from pipelines.render.formulas import ALPHA_MAX, ALPHA_MIN, OPAQUE
 
 # Number of Gaussians in shared memory at a time.
 STEP = 16

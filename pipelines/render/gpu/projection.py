@@ -9,7 +9,7 @@ from fields.map.gaussians import GaussianField
 from fields.runtime.backend import torch_device
 from fields.runtime.compiled_kernel import AsyncReadback, CompiledKernel
 from fields.runtime.engine import ti
-from pipelines.render.cpu.projection import Projection
+from pipelines.render.formulas import ProjectionFormulas
 from pipelines.render.gpu.reductions import THREAD_BITS, THREADS, sum_over_block
 
 # Sorts after every depth. Not infinity, since Taichi's fast-math assumes that there is none.
@@ -19,7 +19,7 @@ BLOCKS = 64
 
 
 @ti.data_oriented
-class DeviceProjection(Projection):
+class DeviceProjection(ProjectionFormulas):
     """Culls, sorts and projects `gaussians` into `projected`, with the formulas of the CPU.
 
     The differentiable loops go over slots, which come in the order of depth: a GPU adds to gradients with atomics that
@@ -27,10 +27,7 @@ class DeviceProjection(Projection):
     """
 
     def __init__(self, gaussians: GaussianField, view: ViewField, projected: ProjectedGaussians) -> None:
-        self.gaussians = gaussians
-        self.view = view
-        self.projected = projected
-        self.tangent = projected.tangent
+        super().__init__(gaussians, view, projected, projected.tangent)
         self._depths = torch.empty(0, dtype=torch.float32, device=torch_device())
         self._cull, self._assign = CompiledKernel(self._cull_all), CompiledKernel(self._assign_sorted)
         self._sum_tangents = CompiledKernel(self._sum_all_tangents)
@@ -40,11 +37,6 @@ class DeviceProjection(Projection):
         self._tangents = torch.zeros((BLOCKS, 6), dtype=torch.float32, device=torch_device())
 
     def forward(self) -> int:
-        """Fill `projected` for the current view.
-
-        Returns:
-            Upper bound on the number of visible Gaussians.
-        """
         self.projected.count = n = self.gaussians.count
         if n == 0:
             self._none_seen()
@@ -67,11 +59,9 @@ class DeviceProjection(Projection):
             self._project_back()
 
     def camera_gradient(self) -> np.ndarray:
-        """Return d loss / d xi (6,) of T_camera_world, summed over slots in a fixed order. Waits for the device."""
         return self.async_camera_gradient().numpy()
 
     def async_camera_gradient(self) -> AsyncReadback:
-        """Return `camera_gradient` as an asynchronous copy."""
         self._sum_tangents(self._tangents)
         return AsyncReadback(self._tangents, summed=True)
 

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from fields.geometry.camera import PinholeCamera
 from fields.map.gaussians import GaussianField
-from pipelines.optimise import gpu_losses
-from pipelines.optimise.gpu_losses import photometric_loss
-from pipelines.optimise.losses import LossValues
+from pipelines.render.formulas import LossValues
+from pipelines.render.gpu import losses as gpu_losses
 from pipelines.render.renderer import Renderer
 from tests.pipelines.scenes import CAMERA, NEAR, POSE, random_gaussians
 
@@ -29,7 +28,7 @@ def compared(renderer: Renderer, camera: PinholeCamera) -> dict[str, NDArray]:
     image = rng.integers(0, 256, (*shape, 4)).astype(np.uint8)
     image[..., 3] = 255
     image[3:9, 2:8] = 0
-    loss = photometric_loss(renderer.images)
+    loss = renderer.loss
     renderer.gaussians.load(random_gaussians(200, seed=8, camera=camera))
     renderer.forward(camera, POSE, NEAR)
     renderer.develop(exposure, vignette)
@@ -70,7 +69,7 @@ def test_values_are_right_whenever_they_are_read(results: tuple, monkeypatch: py
     """At once, after others were made, sent together, and when their tensor is full."""
     monkeypatch.setattr(gpu_losses, "ROWS", 3)
     renderer = Renderer(GaussianField(0, max_gaussians=1 << 12), 64, 64)
-    loss = photometric_loss(renderer.images)
+    loss = renderer.loss
     renderer.forward(CAMERA, POSE, NEAR)  # nothing but black
 
     def evaluate(grey: int) -> LossValues:

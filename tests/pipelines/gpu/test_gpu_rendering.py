@@ -16,7 +16,7 @@ from fields.geometry.camera import PinholeCamera
 from fields.map.gaussians import GaussianField
 from fields.runtime.engine import ti
 from pipelines.render.cpu.binning import Binning
-from pipelines.render.cpu.compositing import OPAQUE
+from pipelines.render.formulas import OPAQUE
 from pipelines.render.gpu.binning import MEMORY
 from pipelines.render.renderer import Renderer
 from tests.pipelines.scenes import CAMERA, NEAR, POSE, random_gaussians

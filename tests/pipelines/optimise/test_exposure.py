@@ -16,7 +16,7 @@ from fields.map.keyframes import KeyframeStore
 from fields.runtime.backend import initialise
 from pipelines.companions.exposure import CHANGED, ExposureRefinement, fitted_gains, light_changes, scene_colours
 from pipelines.online import OnlineMapper
-from pipelines.render.cpu.photometric_model import IDENTITY
+from pipelines.render.formulas import IDENTITY
 from pipelines.settings import ExposureSettings, MappingSettings
 from tests.pipelines.wall import CAMERA, frame
 

@@ -9,7 +9,9 @@ from skimage.metrics import structural_similarity
 
 from fields.map.gaussians import GaussianField
 from fields.runtime.engine import ti
-from pipelines.optimise.losses import AspectPenalty, PhotometricLoss, window_weights
+from pipelines.optimise.adam import AspectPenalty
+from pipelines.render.cpu.losses import PhotometricLoss
+from pipelines.render.formulas import window_weights
 from pipelines.render.renderer import Renderer
 
 WIDTH, HEIGHT = 41, 33

@@ -15,8 +15,8 @@ from fields.map.gaussians import SH_C0, GaussianField
 from fields.map.keyframe import Keyframe
 from fields.map.keyframes import KeyframeStore
 from fields.runtime.engine import ti
-from pipelines.optimise.losses import PhotometricLoss
 from pipelines.optimise.poses import PoseRefinement, ViewAlignment, reprojection
+from pipelines.render.cpu.losses import PhotometricLoss
 from pipelines.render.renderer import Renderer
 from tests.pipelines.scenes import CAMERA as LENS
 from tests.pipelines.scenes import NEAR, POSE, random_gaussians

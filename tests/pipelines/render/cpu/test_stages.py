@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from fields.buffers.tiles import TILE_HEIGHT, TILE_WIDTH
 from fields.geometry.camera import PinholeCamera
 from fields.runtime.engine import ti
-from pipelines.render.cpu.photometric_model import IDENTITY
-from pipelines.render.cpu.projection import ALPHA_MIN
+from pipelines.render.formulas import ALPHA_MIN, IDENTITY
 from pipelines.render.renderer import Renderer
 from tests.pipelines import reference
 from tests.pipelines.differences import STEP, central_differences

@@ -6,67 +6,32 @@ gradient g of the loss with respect to the image and h = vignette * g, the gradi
 """
 # pyright: reportInvalidTypeForm=false
 
-import cv2
 import numpy as np
 import torch
 
 from fields.buffers.images import PAD, ImageBuffers
-from fields.runtime.backend import refuse_too_many_fields
 from fields.runtime.compiled_kernel import HANDED_OUT, AsyncReadback, CompiledKernel
 from fields.runtime.engine import ti
+from pipelines.render.formulas import PhotometricBuffers
 
-IDENTITY = np.eye(3, 4)
-IDENTITY.flags.writeable = False
 # Eight rows per chunk, see `fields.runtime.compiled_kernel`.
 SPREAD = HANDED_OUT // 8
 
 
 @ti.data_oriented
-class PhotometricModel:
-    """Applies exposure and vignette to `images.colour` in place, and propagates `images.colour_grad` back.
-
-    Without exposure and vignette, it does nothing and allocates no memory.
-    """
+class Photometric(PhotometricBuffers):
+    """Applies exposure and vignette to `images.colour` in place, and propagates `images.colour_grad` back."""
 
     def __init__(self, images: ImageBuffers) -> None:
-        self.images = images
-        self.real = images.real
-        self._active = False
-        self._made = False
-        self._exposure = np.array(IDENTITY)
+        super().__init__(images)
         self._sums = np.zeros((images.max_height, 12))
-        self._loaded: tuple[int, int, int] | None = None  # the vignette in the buffer: its id and size
-        self._resized: dict[tuple[int, int, int], tuple[np.ndarray, np.ndarray]] = {}
         self._apply, self._apply_back = CompiledKernel(self._forward), CompiledKernel(self._backward)
 
-    def forward(self, exposure: np.ndarray | None, vignette: np.ndarray | None) -> None:
-        """Apply exposure and vignette to the last rendered image.
-
-        Args:
-            exposure: Exposure (A, b) (3, 4); None for the identity.
-            vignette: Vignette (H, W, 3) at the camera's full size, which is resized to the image; None for no
-                vignetting.
-        """
-        self._active = exposure is not None or vignette is not None
-        if not self._active:
-            return
-        self._make_buffers()
-        self._load(vignette)
-        self._exposure = np.ascontiguousarray(IDENTITY if exposure is None else exposure, dtype=np.float64)
-        self._develop()
-
-    def backward(self) -> None:
-        """Propagate `images.colour_grad` back to the render, and restore the render in `images.colour`."""
-        if self._active:
-            self._undevelop()
-
     def exposure_gradient(self) -> np.ndarray:
-        """Return d loss / d (A, b) (3, 4) of the last image. Call it after `backward`."""
         # Sum the rows in a fixed order, so that two runs agree bit for bit.
         return self._sums[: self.images.height].sum(axis=0).reshape(3, 4)
 
     def async_exposure_gradient(self) -> AsyncReadback:
-        """Return `exposure_gradient` with the interface of the GPU. On the CPU, there is nothing to wait for."""
         return AsyncReadback(torch.from_numpy(self.exposure_gradient()))
 
     def _develop(self) -> None:
@@ -74,42 +39,6 @@ class PhotometricModel:
 
     def _undevelop(self) -> None:
         self._apply_back(self.images.width, self.images.height, self._exposure, self._sums)
-
-    def _make_buffers(self) -> None:
-        if self._made:
-            return
-        self._made = True
-        self.rendered, self.vignette = ti.field(self.real), ti.field(self.real)
-        builder = ti.FieldsBuilder()
-        builder.dense(ti.i, 3 * self.images.plane).place(self.rendered, self.vignette)
-        builder.finalize()
-        refuse_too_many_fields(self.vignette)
-
-    def _load(self, vignette: np.ndarray | None) -> None:
-        """Write the vignette to the buffer at the size of the image, unless it is there already."""
-        width, height = self.images.width, self.images.height
-        key = (id(vignette), width, height)
-        if key == self._loaded:
-            return
-        self._loaded = key
-        if vignette is None:
-            self.vignette.fill(1.0)
-            return
-        if key not in self._resized:
-            image = np.ascontiguousarray(vignette, dtype=np.float32)
-            if image.shape[:2] != (height, width):
-                image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-            # Keep the original alive as long as its id is a key.
-            self._resized[key] = vignette, image
-        self._set_vignette(width, height, self._resized[key][1])
-
-    @ti.kernel
-    def _set_vignette(self, width: ti.i32, height: ti.i32, image: ti.types.ndarray(dtype=ti.f32, ndim=3)):
-        for y in range(height):
-            row = (y + PAD) * self.images.stride + PAD
-            for x in range(width):
-                for c in ti.static(range(3)):
-                    self.vignette[c * self.images.plane + row + x] = image[y, x, c]
 
     @ti.kernel
     def _forward(self, width: ti.i32, height: ti.i32, exposure: ti.types.ndarray(dtype=ti.f64, ndim=2)):

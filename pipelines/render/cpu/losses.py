@@ -1,4 +1,4 @@
-"""Photometric loss (1 - w) L1 + w (1 - SSIM) with its image gradient, and the penalty on elongated Gaussians.
+"""Photometric loss (1 - w) L1 + w (1 - SSIM) with its image gradient.
 
 SSIM [Wang 2004] uses an 11x11 Gaussian window (sigma 1.5) with zero padding, as in 3DGS. With the local moments
 mu = G*x, e_xx = G*xx, e_xy = G*xy, the gradient is
@@ -8,20 +8,13 @@ and e_yy only through their sum, which saves one convolution.
 """
 # pyright: reportIndexIssue=false, reportInvalidTypeForm=false, reportOptionalCall=false, reportOptionalSubscript=false
 
-from collections.abc import Callable
-from functools import cached_property
-
 import numpy as np
-from numpy.typing import NDArray
 
 from fields.buffers.images import PAD, SCRATCH_ROWS, STRIPS, ImageBuffers
-from fields.map.gaussians import GaussianField
 from fields.runtime.compiled_kernel import HANDED_OUT, CompiledKernel, CompiledLoop
 from fields.runtime.engine import ti
+from pipelines.render.formulas import C1, C2, RADIUS, LossValues, window_weights
 
-RADIUS = 5
-C1 = 0.01**2
-C2 = 0.03**2
 # Four strips of a channel, or four rows, per chunk (see `fields.runtime.compiled_kernel`).
 SPREAD = HANDED_OUT // 4
 
@@ -42,58 +35,9 @@ def extent(pixels):
     return pixels & 0xFFFF
 
 
-def window_weights() -> tuple[float, ...]:
-    """The 11 weights of the Gaussian window with sigma 1.5; they sum to 1."""
-    w = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / 1.5) ** 2)
-    return tuple(float(v) for v in w / w.sum())
-
-
-class LossValues:
-    """Means over the valid pixels and channels of one view. On a GPU, the first access waits for the device.
-
-    Args:
-        sums: Returns the sums (4,) of absolute error, SSIM, squared error and the number of values. It is called on the
-            first access.
-    """
-
-    def __init__(self, sums: Callable[[], NDArray[np.float64]]) -> None:
-        self._sums = sums
-
-    @cached_property
-    def _means(self) -> tuple[float, float, float]:
-        l1, ssim, square, count = (float(v) for v in self._sums())
-        count = max(count, 1.0)
-        return l1 / count, ssim / count, square / count
-
-    @property
-    def l1(self) -> float:
-        """Mean absolute error."""
-        return self._means[0]
-
-    @property
-    def ssim(self) -> float:
-        """Mean SSIM."""
-        return self._means[1]
-
-    @property
-    def squared_error(self) -> float:
-        """Mean squared error."""
-        return self._means[2]
-
-    @property
-    def psnr(self) -> float:
-        """Peak signal-to-noise ratio [dB]."""
-        return float(-10.0 * np.log10(max(self.squared_error, 1e-12)))
-
-
 @ti.data_oriented
 class PhotometricLoss:
-    """Compares `images.colour` with `images.reference` at the pixels of `images.valid`, and fills `images.colour_grad`.
-
-    Attributes:
-        lag: Number of steps after which the values should be read, so that the host does not wait. 0 on the CPU, where
-            they are available immediately.
-    """
+    """Compares `images.colour` with `images.reference`. Its values are available at once."""
 
     lag = 0
 
@@ -106,10 +50,6 @@ class PhotometricLoss:
         self._differentiate = CompiledKernel(self._differentiate_strips)
 
     def forward(self) -> LossValues:
-        """Evaluate the loss, and write the SSIM map to `images.ssim`.
-
-        Masked pixels of the render are replaced by the reference, so that they do not affect any window.
-        """
         width, height = self.images.width, self.images.height
         if self.images.masked:
             self._mask(width * height, width, height)
@@ -119,15 +59,9 @@ class PhotometricLoss:
         return LossValues(lambda: sums)
 
     def send(self) -> None:
-        """Start the asynchronous copy of the values so far to the host. Does nothing on the CPU."""
+        pass  # nothing to wait for
 
     def backward(self, ssim_weight: float, scale: float = 1.0) -> None:
-        """Fill `images.colour_grad` with scale * d loss / d colour, loss = (1 - w) L1 + w (1 - SSIM).
-
-        Args:
-            ssim_weight: Weight w of 1 - SSIM.
-            scale: Factor on the gradient.
-        """
         count = max(float(self._sums[:, 3].sum()), 1.0)
         self._differentiate(
             self.images.width,
@@ -268,44 +202,3 @@ class PhotometricLoss:
                 sign = ti.select(a > b, 1.0, ti.select(a < b, -1.0, 0.0))
                 gradient = by_l1 * sign + by_ssim * (by_mean + 2.0 * a * by_square + b * by_product)
                 self.images.colour_grad[channel + row + x] = gradient * self.images.valid[row + x]
-
-
-@ti.data_oriented
-class AspectPenalty:
-    """Penalty on Gaussians with an aspect ratio above 10:1 (the paper's supplementary settings).
-
-    The penalty is weight / N * sum over the touched Gaussians of max(0, s_max - 10 s_min)^2, with scales s in scene
-    depths.
-    """
-
-    def __init__(self, gaussians: GaussianField, max_ratio: float = 10.0) -> None:
-        self.gaussians = gaussians
-        self.max_ratio = max_ratio
-        self._add = CompiledLoop(self._backward, 20)
-
-    def backward(self, weight: float, scene_depth: float) -> None:
-        """Add the gradient of the penalty to the gradients of the log-scales.
-
-        Args:
-            weight: Weight of the penalty.
-            scene_depth: Depth of the scene [scene units].
-        """
-        count = self.gaussians.count
-        if count:
-            self._add(count, count, weight / count, 1.0 / float(scene_depth))
-
-    @ti.kernel
-    def _backward(self, alone: ti.template(), count: ti.i32, weight: ti.f64, per_depth: ti.f64):
-        ti.loop_config(serialize=alone)
-        for i in range(count):
-            if self.gaussians.touched[i] != 0:
-                scale = ti.exp(self.gaussians.log_scale[i]) * ti.cast(per_depth, self.gaussians.real)
-                longest, shortest = scale.max(), scale.min()
-                excess = longest - self.max_ratio * shortest
-                if excess > 0.0:
-                    pull = 2.0 * ti.cast(weight, self.gaussians.real) * excess
-                    for c in ti.static(range(3)):
-                        is_longest = ti.cast(scale[c] == longest, self.gaussians.real)
-                        is_shortest = ti.cast(scale[c] == shortest, self.gaussians.real)
-                        gradient = pull * scale[c] * (is_longest - self.max_ratio * is_shortest)
-                        self.gaussians.log_scale.grad[i][c] = self.gaussians.log_scale.grad[i][c] + gradient

@@ -8,15 +8,15 @@ from fields.buffers.images import PAD, ImageBuffers
 from fields.runtime.backend import torch_device, without_waiting
 from fields.runtime.compiled_kernel import AsyncReadback, CompiledKernel
 from fields.runtime.engine import ti
-from pipelines.render.cpu.photometric_model import PhotometricModel
+from pipelines.render.formulas import PhotometricBuffers
 from pipelines.render.gpu.reductions import THREAD_BITS, THREADS, BlockSums, sum_over_block
 
 NUMBERS = ti.types.ndarray(dtype=ti.f32, ndim=1)
 
 
 @ti.data_oriented
-class DevicePhotometricModel(PhotometricModel):
-    """Applies exposure and vignette to `images.colour` in place, and propagates gradients; see `PhotometricModel`."""
+class DevicePhotometric(PhotometricBuffers):
+    """Applies exposure and vignette to `images.colour` in place, and propagates gradients; see `Photometric`."""
 
     def __init__(self, images: ImageBuffers) -> None:
         super().__init__(images)
@@ -30,11 +30,9 @@ class DevicePhotometricModel(PhotometricModel):
         self._gradient = torch.zeros(12, dtype=torch.float32, device=torch_device())
 
     def exposure_gradient(self) -> np.ndarray:
-        """Return d loss / d (A, b) (3, 4) of the last image, after `backward`. Waits for the device."""
         return self.async_exposure_gradient().numpy().astype(np.float64)
 
     def async_exposure_gradient(self) -> AsyncReadback:
-        """Return `exposure_gradient` in float32 as an asynchronous copy."""
         return AsyncReadback(self._gradient.view(3, 4))
 
     def _develop(self) -> None:

@@ -1,7 +1,7 @@
 """The photometric loss on a GPU: one block per tile and channel, with both SSIM windows in shared memory.
 
-The formulas are those of `pipelines/optimise/losses.py`. The sums stay on the device, where the backward pass reads the
-number of valid pixels. The host reads the values later.
+The formulas are those of `pipelines/render/cpu/losses.py`. The sums stay on the device, where the backward pass reads
+the number of valid pixels. The host reads the values later.
 """
 # pyright: reportGeneralTypeIssues=false, reportIndexIssue=false, reportInvalidTypeForm=false
 
@@ -12,10 +12,10 @@ import torch
 
 from fields.buffers.device_pairs import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, tile_count
 from fields.buffers.images import PAD, ImageBuffers
-from fields.runtime.backend import on_gpu, torch_device
+from fields.runtime.backend import torch_device
 from fields.runtime.compiled_kernel import AsyncReadback, CompiledKernel
 from fields.runtime.engine import ti
-from pipelines.optimise.losses import C1, C2, RADIUS, LossValues, PhotometricLoss, window_weights
+from pipelines.render.formulas import C1, C2, RADIUS, LossValues, window_weights
 from pipelines.render.gpu.reductions import THREAD_BITS, THREADS, BlockSums, sum_over_block
 
 # Side of a tile with the border that its windows reach.
@@ -55,8 +55,8 @@ class _Values:
 
 
 @ti.data_oriented
-class DevicePhotometricLoss(PhotometricLoss):
-    """`PhotometricLoss` on a GPU. Its values are read asynchronously."""
+class DevicePhotometricLoss:
+    """Compares `images.colour` with `images.reference`. Its values are read asynchronously."""
 
     lag = 1
 
@@ -73,13 +73,6 @@ class DevicePhotometricLoss(PhotometricLoss):
         self._values = _Values()
 
     def forward(self) -> LossValues:
-        """Evaluate the loss, and write the SSIM map to `images.ssim`.
-
-        Masked pixels of the render are replaced by the reference, so that they do not affect any window.
-
-        Returns:
-            Values that wait for the device when they are read.
-        """
         if self._values.written == ROWS:
             self._values = _Values()
         values, row = self._values, self._values.written
@@ -94,7 +87,6 @@ class DevicePhotometricLoss(PhotometricLoss):
         self._values.send()
 
     def backward(self, ssim_weight: float, scale: float = 1.0) -> None:
-        """Fill `images.colour_grad` with scale * d loss / d colour, loss = (1 - w) L1 + w (1 - SSIM)."""
         by_l1, by_ssim = scale * (1.0 - ssim_weight), -scale * ssim_weight
         self._differentiate(self.images.width, self.images.height, float(by_l1), float(by_ssim), self._totals)
 
@@ -256,8 +248,3 @@ class DevicePhotometricLoss(PhotometricLoss):
                 by_ssim = smooth[0] + 2.0 * a * smooth[1] + b * smooth[2]
                 gradient = per_pixel * (l1_scale * sign + ssim_scale * by_ssim)
                 self.images.colour_grad[start + p] = gradient * self.images.valid[p]
-
-
-def photometric_loss(images: ImageBuffers) -> PhotometricLoss:
-    """Create the photometric loss for the device that Taichi runs on."""
-    return DevicePhotometricLoss(images) if on_gpu() else PhotometricLoss(images)
