@@ -8,8 +8,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from modp_ti.commands.shared import BAD_INPUT, FAULT
-from modp_ti.files.ending_signals import EndingSignals, exit_code
 from modp_ti.files.errors import InputError
+from modp_ti.files.processes import EndingSignals, exit_code
 
 
 @contextmanager

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from modp_ti.files.ending_signals import EndingSignals
+from modp_ti.files.processes import EndingSignals
 
 
 class RunStopped(Exception):  # noqa: N818 - it is no error

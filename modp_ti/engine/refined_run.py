@@ -20,8 +20,7 @@ from modp_ti.engine.results import Results, summary_of
 from modp_ti.engine.snapshots import FILE
 from modp_ti.files import read_json
 from modp_ti.files.errors import InputError
-from modp_ti.files.run_folder import require_usable
-from modp_ti.files.sole_use import sole_use
+from modp_ti.files.run_folder import require_usable, sole_use
 from modp_ti.inputs.delivered_frames import DeliveredFrames
 from modp_ti.outputs.evaluation import FrameScore, MapVersion, evaluate
 from modp_ti.outputs.formats.run_files import read_exposures, read_masks, read_scores, write_exposures

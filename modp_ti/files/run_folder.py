@@ -9,16 +9,19 @@ import json
 import os
 import re
 import shutil
+import sys
 import tempfile
+import threading
+import time
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from itertools import takewhile
 from pathlib import Path, PurePosixPath
 
 from modp_ti.files.atomic import replace_text, sync_folder
 from modp_ti.files.errors import InputError
-from modp_ti.files.reading import read_json
-from modp_ti.files.sole_use import sole_use
+from modp_ti.files.reading import read_json, reading
 
 PRIVATE = ".modp-ti"
 """Name of the subfolder of the list and of temporary files."""
@@ -31,7 +34,7 @@ OF_A_RUN = (
     "config.yaml splats.ply trajectory.txt frames.json exposure.json metrics.json scores.csv report.html session.zip "
     "snapshot.npz recording.yaml colmap masks renders sfm"
 ).split()
-# A folder without a list whose config.yaml begins like this is a copy or of an earlier version: these files are listed.
+# A folder without a list whose config.yaml begins like this is a copy: these files are listed.
 SETTINGS = b"# Every setting of this run: "
 RECOGNISED = re.compile(
     rf"{'|'.join(map(re.escape, OF_A_RUN))}|(renders|masks)/[0-9]+\.png|colmap/(images|masks)/.+\.png|sfm/made_of\.txt"
@@ -41,6 +44,8 @@ RECOGNISED = re.compile(
 OF_THE_SYSTEM = re.compile(r"\..*|Thumbs\.db|desktop\.ini", re.IGNORECASE)
 # Time that a run waits for another process to end [s].
 PATIENCE = 2.0
+# The folders that this process holds: the thread that locked each, and its device and inode.
+_held: set[tuple[int, int, int]] = set()
 
 
 @dataclass(frozen=True)
@@ -193,7 +198,7 @@ def _commit(output: Path, staged: Path, outdated: Collection[str]) -> None:
 
 
 def _move(output: Path, record: _Record) -> None:
-    """Do what a record says. It may have been done in part already, and the record may be a stranger's."""
+    """Do what a record says. It may have been done in part already."""
     staged = output / PRIVATE / record.staged
     files = sorted(_files(staged), key=lambda file: (file.name == LAST, file))
     refuse_foreign(output, [*record.gone, *(file.relative_to(staged).as_posix() for file in files)])
@@ -225,29 +230,14 @@ def _record(output: Path) -> _Record:
     """Read the list of a folder, or make that of a folder without one. Raises InputError if it is damaged."""
     file = _private(output) / LIST
     if not os.path.lexists(file):
-        names = [each.relative_to(output).as_posix() for each in _files(output)] if _is_recognised(output) else []
-        return _Record(frozenset(name for name in names if RECOGNISED.fullmatch(name)))
-    data, damaged = read_json(file, "of runs"), InputError(f"{file}: damaged: remove it, or name another folder")
-    try:
-        record = _Record(frozenset(data["files"]), data["staged"], frozenset(data["gone"]))
-    except (TypeError, KeyError):
-        raise damaged from None
-    names = [*record.files, *record.gone, record.staged or "new"]
-    if not all(isinstance(name, str) and not BEYOND.search(name) for name in names):
-        raise damaged
-    return record
-
-
-# Names in a list that are not those of files below the folder, or of private ones.
-BEYOND = re.compile(rf"^$|^/|//|/$|\0|(^|/)\.\.?(/|$)|^{re.escape(PRIVATE)}(/|$)")
-
-
-def _is_recognised(output: Path) -> bool:
-    try:
-        with (output / "config.yaml").open("rb") as file:
-            return file.read(len(SETTINGS)) == SETTINGS
-    except OSError:
-        return False
+        with suppress(OSError):
+            if (output / "config.yaml").read_bytes().startswith(SETTINGS):  # a copy without the list
+                names = [each.relative_to(output).as_posix() for each in _files(output)]
+                return _Record(frozenset(filter(RECOGNISED.fullmatch, names)))
+        return _Record()
+    data = read_json(file, "of runs")
+    with reading(file, "; remove it, or name another folder"):
+        return _Record(frozenset(map(str, data["files"])), str(data["staged"]), frozenset(map(str, data["gone"])))
 
 
 def _write(output: Path, record: _Record) -> None:
@@ -268,3 +258,74 @@ def _files(place: Path) -> Iterator[Path]:
 
 def _foreign(path: Path) -> InputError:
     return InputError(f"{path}: is there already, and no run has written it: move it, or name another folder (output)")
+
+
+# ---- one process at a time -----------------------------------------------------------------------------------------
+
+
+@contextmanager
+def sole_use(folder: Path, patience: float = 20.0) -> Iterator[None]:
+    """Lock a folder, which is created if it does not exist, for this thread. The lock ends with the process.
+
+    A thread may lock a folder that it has locked already. Folders that were created for it and are still empty at the
+    end are removed.
+
+    File systems that have no locks for folders, such as some network file systems, lock nothing, and neither does
+    Windows.
+
+    Args:
+        folder: The folder.
+        patience: How long to wait for another process to end [s].
+
+    Raises:
+        InputError: If another process still holds the lock, or the folder cannot be created.
+    """
+    folder = folder.absolute()
+    missing = list(takewhile(lambda place: not os.path.lexists(place), (folder, *folder.parents)))
+    until = time.monotonic() + patience
+    while (handle := _locked(folder)) is None:
+        if time.monotonic() > until:
+            raise InputError(f"{folder}: another process is at work there: wait for it, end it, or name another folder")
+        time.sleep(0.1)
+    holder = _holder(handle)
+    again = holder in _held
+    _held.add(holder)
+    try:
+        yield
+    finally:
+        if not again:
+            _held.discard(holder)
+        with suppress(OSError):  # one that holds something stays, and so do its parents
+            for place in missing:
+                place.rmdir()
+        os.close(handle)
+
+
+def _holder(handle: int) -> tuple[int, int, int]:
+    there = os.fstat(handle)
+    return threading.get_ident(), there.st_dev, there.st_ino
+
+
+def _locked(folder: Path) -> int | None:
+    """Make, open and lock a folder without waiting; return None if another process holds the lock."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        handle = os.open(os.devnull if sys.platform == "win32" else folder, os.O_RDONLY)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be written: {error.strerror}") from None
+    if sys.platform == "win32" or _holder(handle) in _held:
+        return handle
+    import fcntl
+
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(handle)
+        return None
+    except OSError:  # not on this file system
+        return handle
+    with suppress(FileNotFoundError):
+        if os.path.samestat(os.fstat(handle), os.stat(folder)):
+            return handle
+    os.close(handle)  # of a folder that the process that held it has removed
+    return None

@@ -17,9 +17,9 @@ from typing import Any
 
 from modp_ti.config.scene_file import scene_from_data
 from modp_ti.config.settings import SceneConfig
-from modp_ti.files.child_environment import child_environment
 from modp_ti.files.errors import InputError
-from modp_ti.files.sole_use import sole_use
+from modp_ti.files.processes import child_environment
+from modp_ti.files.run_folder import sole_use
 from modp_ti.files.storage import Storage, StorageError
 from modp_ti.many.scenes import OUTPUT, finished_metrics
 from modp_ti.outputs.progress import StageProgress

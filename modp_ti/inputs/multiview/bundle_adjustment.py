@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from modp_ti.files.child_environment import child_environment
+from modp_ti.files.processes import child_environment
 
 if TYPE_CHECKING:
     from modp_ti.files.quiet_pycolmap import pycolmap

@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from modp_ti.files.ending_signals import RecordingInterrupt
 from modp_ti.files.errors import InputError
+from modp_ti.files.processes import RecordingInterrupt
 from modp_ti.files.urls import shown_url
 from modp_ti.inputs.sources.backlog import Arrivals, Backlog
 from modp_ti.inputs.sources.frame_store import FrameStore, kept_frames

@@ -14,8 +14,8 @@ import cv2
 
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
-from modp_ti.files.ending_signals import left_to_parent
 from modp_ti.files.errors import InputError
+from modp_ti.files.processes import left_to_parent
 from modp_ti.files.terminal import own_terminal
 from modp_ti.inputs.frame_record import FrameRecord
 from modp_ti.inputs.klt import KltTracker, open_klt

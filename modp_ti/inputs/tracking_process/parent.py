@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
 from modp_ti.config.settings import SceneConfig
-from modp_ti.files.child_environment import child_environment
-from modp_ti.files.ending_signals import RecordingInterrupt, withheld
 from modp_ti.files.errors import InputError, UnreadableImageError
+from modp_ti.files.processes import RecordingInterrupt, child_environment, withheld
 from modp_ti.inputs.opening import open_source
 from modp_ti.inputs.protocol import Event, LiveCounts, Progress, Tracker
 from modp_ti.inputs.replay import pictures_again

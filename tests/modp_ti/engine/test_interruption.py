@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from modp_ti.engine.interruption import Interruption, RunStopped
-from modp_ti.files.ending_signals import RecordingInterrupt
+from modp_ti.files.processes import RecordingInterrupt
 
 
 def press() -> None:

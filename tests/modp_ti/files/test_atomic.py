@@ -8,11 +8,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from modp_ti.files import atomic
-from modp_ti.files.atomic import replace_file, replace_text, replacing, write_picture, written_aside
+from modp_ti.files.atomic import replace_file, replace_text, replacing, written_aside
 from tests.patience import PATIENCE
 
 PROJECT = Path(__file__).resolve().parents[3]
@@ -61,32 +59,6 @@ def test_a_full_disk_leaves_what_was_there(tmp_path: Path) -> None:
     assert int(result.stdout) == errno.EFBIG
     assert target.read_bytes() == b"first"
     assert os.listdir(tmp_path) == ["a.bin"]
-
-
-def test_the_file_is_on_the_disk_before_it_takes_its_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    done: list[str] = []
-    sync, move = os.fsync, os.replace
-
-    def fsync(handle: int) -> None:
-        done.append("folder" if os.path.isdir(f"/proc/self/fd/{handle}") else "file")
-        sync(handle)
-
-    def replace(a: Path, b: Path) -> None:
-        done.append("replace")
-        move(a, b)
-
-    monkeypatch.setattr(atomic.os, "fsync", fsync)
-    monkeypatch.setattr(atomic.os, "replace", replace)
-    replace_file(tmp_path / "a", b"content")
-    assert done == ["file", "replace", "folder"]
-
-
-def test_a_picture_is_what_it_was(tmp_path: Path) -> None:
-    import cv2
-
-    image = np.random.default_rng(0).integers(0, 255, (7, 9, 3), dtype=np.uint8)
-    write_picture(tmp_path / "a.png", image)
-    np.testing.assert_array_equal(cv2.imread(str(tmp_path / "a.png"))[..., ::-1], image)
 
 
 def test_no_write_follows_a_symbolic_link_or_takes_a_file_of_another_name(tmp_path: Path) -> None:

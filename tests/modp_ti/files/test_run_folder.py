@@ -6,6 +6,7 @@ import errno
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -14,7 +15,6 @@ import pytest
 
 from modp_ti.config.scene_file import dump_scene
 from modp_ti.config.settings import SceneConfig
-from modp_ti.files.atomic import replace_text
 from modp_ti.files.errors import InputError
 from modp_ti.files.run_folder import (
     PRIVATE,
@@ -24,14 +24,19 @@ from modp_ti.files.run_folder import (
     require_usable,
     require_whole,
     run_folder,
+    sole_use,
 )
-from modp_ti.files.sole_use import sole_use
 from tests.patience import PATIENCE
 
 PROJECT = Path(__file__).resolve().parents[3]
 FIRST = {"splats.ply": "1", "colmap/cameras.bin": "1", "colmap/old.bin": "1", "masks/000001.png": "1"}
 SECOND = {"splats.ply": "2", "colmap/cameras.bin": "2", "trajectory.txt": "2", "metrics.json": "2"}
 
+HOLDS = """
+import sys, time; from pathlib import Path; from modp_ti.files.run_folder import sole_use
+with sole_use(Path(sys.argv[1])):
+    print("holds", flush=True); time.sleep(1000)
+"""
 # Writes files over those of a folder, and dies at the n-th rename or removal.
 DIES = """
 import json, os, sys; from pathlib import Path; from modp_ti.files.run_folder import appearing
@@ -136,47 +141,6 @@ def test_files_next_to_those_of_a_run_stay(tmp_path: Path) -> None:
     assert files_of(tmp_path / "out.partial") == {"a": "mine"}
 
 
-def test_a_folder_that_became_a_link_is_not_followed(tmp_path: Path) -> None:
-    output, pictures = tmp_path / "out", _tree(tmp_path / "pictures", {"cameras.bin": "mine", "old.bin": "mine"})
-    fill(output, FIRST)
-    shutil.rmtree(output / "colmap")
-    (output / "colmap").symlink_to(pictures)
-    with pytest.raises(InputError):
-        fill(output, SECOND, ("colmap",))
-    assert files_of(pictures) == {"cameras.bin": "mine", "old.bin": "mine"}
-
-
-@pytest.mark.parametrize(
-    "record",
-    [
-        *({"files": [name], "staged": "", "gone": [name]} for name in ("../victim", "/etc/x", "a/../../victim", "", 3)),
-        {"files": ["a"], "staged": "../../elsewhere", "gone": []},
-        {"files": ["a"], "staged": 5, "gone": []},
-        {"files": 5, "staged": "", "gone": []},
-        [],
-    ],
-)
-def test_a_list_from_a_stranger_reaches_nothing_outside(tmp_path: Path, record: object) -> None:
-    _tree(tmp_path, {"victim": "mine", "elsewhere/b": "mine", "out/a": "1"})
-    (tmp_path / "out" / PRIVATE).mkdir()
-    replace_text(tmp_path / "out" / PRIVATE / "files.json", json.dumps(record))
-    for act in (lambda: require_whole(tmp_path / "out"), lambda: fill(tmp_path / "out", SECOND, ("..", "victim"))):
-        with pytest.raises(InputError):
-            act()
-    assert (tmp_path / "victim").exists() and (tmp_path / "elsewhere" / "b").exists()
-
-
-def test_a_half_done_move_from_a_stranger_does_not_follow_his_links(tmp_path: Path) -> None:
-    output, home = tmp_path / "out", _tree(tmp_path / "home", {"keys": "mine"})
-    _tree(output, {f"{PRIVATE}/new/colmap/keys": "his", f"{PRIVATE}/new/colmap/more": "his"})
-    (output / "colmap").symlink_to(home)
-    record = {"files": ["colmap/keys", "colmap/more"], "staged": "new", "gone": ["colmap/keys"]}
-    replace_text(output / PRIVATE / "files.json", json.dumps(record))
-    with pytest.raises(InputError):
-        require_whole(output)
-    assert files_of(home) == {"keys": "mine"}
-
-
 def test_a_folder_of_an_earlier_version_is_known_by_its_settings(tmp_path: Path) -> None:
     output = _tree(tmp_path / "out", FIRST | {"colmap/mine.db": "mine"})
     assert not is_run_folder(output)
@@ -207,3 +171,15 @@ def test_a_folder_that_cannot_be_written_is_refused_at_once(tmp_path: Path, plac
             act(tmp_path / place)
         assert "\n" not in str(refused.value)
     assert os.listdir(tmp_path) == ["file"]
+
+
+def test_a_second_process_is_refused_until_the_first_is_gone(tmp_path: Path) -> None:
+    folder = tmp_path / "new" / "folder"
+    process = subprocess.Popen([sys.executable, "-c", HOLDS, str(folder)], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None and process.stdout.readline() == "holds\n"
+    with pytest.raises(InputError, match="another process is at work there"), sole_use(folder, patience=0.2):
+        pass
+    os.kill(process.pid, signal.SIGKILL)
+    with sole_use(folder, PATIENCE):
+        assert list(folder.iterdir()) == []
+    process.communicate()

@@ -42,13 +42,6 @@ def test_a_folder_comes_back_as_it_was(storage: Storage, tmp_path: Path) -> None
     assert {file.relative_to(tmp_path / "to").as_posix(): file.read_bytes() for file in files} == contents
 
 
-def test_a_probe_leaves_nothing(storage: Storage, tmp_path: Path) -> None:
-    storage.probe()
-    (tmp_path / "to").mkdir()
-    storage.get_folder(tmp_path / "to")
-    assert list((tmp_path / "to").iterdir()) == []
-
-
 def test_what_was_there_stays_where_a_copy_fails(tmp_path: Path) -> None:
     storage = Storage(f"file://{tmp_path}/store")
     (tmp_path / "file").write_bytes(b"first")
@@ -68,8 +61,3 @@ def test_failures_are_one_line(tmp_path: Path, method: str) -> None:
     with pytest.raises(StorageError) as error:
         getattr(storage, method)(*arguments[method])
     assert str(error.value) == f"file://{tmp_path}/file/store: cannot be written: Not a directory"
-
-
-def test_kinds_of_storage_that_are_not_there_are_said() -> None:
-    with pytest.raises(StorageError, match="nonsense://x: cannot be opened: Protocol not known: nonsense"):
-        Storage("nonsense://x")

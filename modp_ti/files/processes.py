@@ -1,10 +1,14 @@
-"""The signals that end a run: Ctrl-C, SIGTERM (`kill`, `docker stop`, a time limit), and SIGHUP (a closed terminal)."""
+"""Processes of ours: the signals that end them, and the environment of those that we start.
+
+The signals are Ctrl-C, SIGTERM (`kill`, `docker stop`, a time limit) and SIGHUP (a closed terminal).
+"""
 
 from __future__ import annotations
 
 import os
 import select
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -137,3 +141,15 @@ def _leave_closed_terminal() -> None:
         if what & (select.POLLHUP | select.POLLERR):
             os.dup2(nowhere, descriptor)
     os.close(nowhere)
+
+
+def child_environment(threads: int | None = None) -> dict[str, str]:
+    """Return the environment variables for `python -c` in another process, which finds the same modules.
+
+    Args:
+        threads: Number of threads of the numerical libraries, None for their own choice.
+    """
+    places = os.pathsep.join(place or os.getcwd() for place in sys.path)
+    libraries = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+    limits = {} if threads is None else dict.fromkeys(libraries, str(threads))
+    return {**os.environ, **limits, "PYTHONPATH": places, "PYTHONSAFEPATH": "1"}

@@ -8,8 +8,8 @@ from collections.abc import Iterator
 import pytest
 
 from modp_ti.engine.interruption import Interruption
-from modp_ti.files import ending_signals
-from modp_ti.files.ending_signals import EndingSignals, RecordingInterrupt, exit_code
+from modp_ti.files import processes
+from modp_ti.files.processes import EndingSignals, RecordingInterrupt, exit_code
 
 CODES = {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGHUP: 129}
 
@@ -35,7 +35,7 @@ def as_in_a_terminal() -> Iterator[None]:
 def test_the_first_is_noted_and_a_second_stops_at_once(
     first: signal.Signals, second: signal.Signals, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(ending_signals, "SAME_HANGUP", 0.0)
+    monkeypatch.setattr(processes, "SAME_HANGUP", 0.0)
     signals = EndingSignals()
     with Interruption(lambda: None) as stop:
         stop.begin()
