@@ -7,28 +7,18 @@ projection, ray by ray, and its own (slower) undistortion.
 from __future__ import annotations
 
 import importlib.util
-import sys
 
 import cv2
 import numpy as np
 import pytest
 
 from modp_ti.config.settings import SourceSettings, VrsSettings
-from modp_ti.files.errors import InputError
 from modp_ti.inputs.opening import open_source
 from modp_ti.inputs.sources import FrameReader
 
 needs_library = pytest.mark.skipif(
     importlib.util.find_spec("projectaria_tools") is None, reason="projectaria-tools is not installed"
 )
-
-
-def test_missing_library_is_named_with_its_installation(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "projectaria_tools", None)
-    monkeypatch.setitem(sys.modules, "projectaria_tools.core", None)
-    with pytest.raises(InputError, match=r"walk\.vrs: reading a VRS .* pip install 'modp-ti\[aria\]'$") as caught:
-        open_source(SourceSettings(path=tmp_path / "walk.vrs"))
-    assert "\n" not in str(caught.value)
 
 
 @pytest.fixture
@@ -108,21 +98,3 @@ def test_parts_that_the_fisheye_does_not_see_are_masked(recording):
     assert picture.mask[400, 400] and not picture.mask[10, 10]
     assert made.read(made.names[0])[~picture.mask].max() == 0
     assert "give its vignetting mask as source.vignette" in made.notes[1]
-
-
-@needs_library
-def test_faulty_recordings_and_masks_are_named(recording, mask, tmp_path):
-    with pytest.raises(InputError, match=r"full_reso_mask\.png is 2880x2880, the recorded images are 1408x1408"):
-        open_source(SourceSettings(path=recording, vignette=mask.with_name("rgb_vignetting_full_reso_mask.png")))
-    file = tmp_path / "walk.vrs"
-    data = recording.read_bytes()
-    for content, message in (
-        (b"no recording", "not a VRS recording, or it is cut off before its first image"),
-        (data[:3000], "not a VRS recording, or it is cut off before its first image"),
-        (data[:100_000], "holds no image of camera-rgb"),
-    ):
-        file.write_bytes(content)
-        with pytest.raises(InputError, match=message):
-            open_source(SourceSettings(path=file))
-    with pytest.raises(InputError, match=r"gone\.vrs: no such VRS file"):
-        open_source(SourceSettings(path=tmp_path / "gone.vrs"))

@@ -7,7 +7,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from modp_ti.inputs.sources.distortion import NO_DISTORTION, Distortion, colmap_intrinsics
+from modp_ti.inputs.sources.distortion import Distortion, colmap_intrinsics
 
 MODELS = {
     "SIMPLE_PINHOLE": [500, 318, 242],
@@ -83,13 +83,3 @@ def test_beyond_the_fold_there_is_no_inverse():
     assert np.isnan(distortion.undistort(np.array([[0.71, 0.0], [2.0, 2.0]]), limit=3.0)).all()
     ideal = np.array([[0.0, 0.0], [0.6, 0.6], [0.0, -1.0]])
     np.testing.assert_allclose(distortion.undistort(distortion.distort(ideal), limit=3.0), ideal, atol=1e-8)
-
-
-def test_no_distortion_is_the_identity():
-    points = grid(3, 3)
-    assert NO_DISTORTION.is_identity
-    assert Distortion((0.0, 0.0), tangential=(0.0, 0.0)).is_identity
-    assert not Distortion(fisheye=True).is_identity
-    assert np.array_equal(NO_DISTORTION.undistort(points, 1.0), points)
-    np.testing.assert_allclose(NO_DISTORTION.distort(points), points)
-    assert Distortion((0.1,)).undistort(np.zeros((0, 2)), 1.0).shape == (0, 2)

@@ -156,19 +156,6 @@ def test_masks_that_are_all_black_are_refused_at_the_start(images: Path, tmp_pat
         reader(images, masks=tmp_path / "masks").require_fitting([("a.png", Undistorter(PINHOLE))])
 
 
-def test_a_missing_or_misfitting_mask_is_named_before_anything_is_decoded(images: Path, tmp_path: Path) -> None:
-    frames = [("a.png", Undistorter(PINHOLE))]
-    write(tmp_path / "masks/b.png", half_mask())
-    masks = reader(images, masks=tmp_path / "masks")
-    with pytest.raises(InputError, match=r"has no mask for a\.png: add a\.png"):
-        masks.require_fitting(frames)
-    write(tmp_path / "masks/a.png", half_mask()[:, :-2])
-    with pytest.raises(InputError, match=r"a\.png is 62x48, its image a\.png is 64x48"):
-        reader(images, masks=tmp_path / "masks").require_fitting(frames)
-    with pytest.raises(InputError, match=r"no such folder of images \(source\.masks\)"):
-        reader(images, masks=tmp_path / "nowhere")
-
-
 # ---- vignette --------------------------------------------------------------------------------------------------
 
 
@@ -212,21 +199,19 @@ def test_a_grey_vignette_serves_all_channels_and_where_it_is_black_pixels_do_not
     assert picture.vignette.min() > 0
 
 
-def test_all_frames_of_a_camera_share_one_vignette(images: Path, tmp_path: Path) -> None:
-    write(tmp_path / "v.png", np.full((HEIGHT, WIDTH), 200, np.uint8))
-    source, undistorter = reader(images, vignette=tmp_path / "v.png"), Undistorter(PINHOLE)
-    assert source.read("a.png", undistorter).vignette is source.read("a.png", undistorter).vignette
-
-
-def test_a_vignette_that_cannot_be_used_is_named(images: Path, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"v\.png: no such file; it should be the vignette"):
-        reader(images, vignette=tmp_path / "v.png")
-    (tmp_path / "v.png").write_bytes(b"no image")
-    with pytest.raises(InputError, match=r"v\.png: the vignette is no image"):
-        reader(images, vignette=tmp_path / "v.png")
-    write(tmp_path / "v.png", np.zeros((HEIGHT, WIDTH), np.uint8))
-    with pytest.raises(InputError, match=r"v\.png: the vignette is black"):
-        reader(images, vignette=tmp_path / "v.png")
-    write(tmp_path / "v.png", np.full((HEIGHT, HEIGHT), 9, np.uint8))
-    with pytest.raises(InputError, match=r"v\.png is 48x48, the images are 64x48"):
-        reader(images, vignette=tmp_path / "v.png").require_fitting([("a.png", Undistorter(PINHOLE))])
+def test_masks_and_vignettes_that_cannot_be_used_are_refused_before_anything_is_decoded(
+    images: Path, tmp_path: Path
+) -> None:
+    frames = [("a.png", Undistorter(PINHOLE))]
+    write(tmp_path / "others/b.png", half_mask())
+    write(tmp_path / "small/a.png", half_mask()[:, :-2])
+    write(tmp_path / "square.png", np.full((HEIGHT, HEIGHT), 9, np.uint8))
+    write(tmp_path / "black.png", np.zeros((HEIGHT, WIDTH), np.uint8))
+    (tmp_path / "text.png").write_bytes(b"no image")
+    for setting, names in {
+        "masks": ["others", "small", "none"],
+        "vignette": ["square.png", "black.png", "text.png", "none.png"],
+    }.items():
+        for name in names:
+            with pytest.raises(InputError, match=name):
+                reader(images, **{setting: tmp_path / name}).require_fitting(frames)

@@ -5,21 +5,13 @@ from __future__ import annotations
 import os
 import re
 import signal
-import subprocess
-import sys
-import threading
 import time
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
-from fields.runtime import process
-from modp_ti.config.settings import IntrinsicsSettings, SourceSettings
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.klt import open_klt
-from modp_ti.inputs.opening import open_source
 from modp_ti.inputs.sources import live
 from modp_ti.inputs.sources.live import LiveSource
 from tests.modp_ti.inputs.mjpeg_camera import MjpegCamera, encoded
@@ -102,18 +94,6 @@ def test_frames_arrive_in_order_with_their_times_and_can_be_read_again(camera, o
     assert source.notes[1:] == ["the camera is guessed", ended]
 
 
-def test_what_is_read_again_is_what_the_decoder_gave(camera, opened):
-    camera.send(*range(4))
-    camera.end()
-    source = opened()
-    name = list(source.arriving(0, None, 1))[3]
-    expected = np.asarray(cv2.imdecode(np.frombuffer(jpeg(3), np.uint8), cv2.IMREAD_COLOR))[..., ::-1]
-    image = source.read(name)
-    assert np.abs(image.astype(int) - expected).max() <= 2  # two decoders of JPEG
-    source._last = None  # so that it is read from the disk
-    assert np.array_equal(source.read(name), image)
-
-
 def test_a_frame_is_delivered_before_the_next_has_come(camera, opened):
     camera.send(0, 1, 2, 3, 4)  # the decoder looks at some before it opens
     source = opened()
@@ -156,16 +136,6 @@ def test_a_slow_tracker_gets_thinned_frames_and_all_are_counted(camera, opened, 
     assert len(list(source._store.folder.iterdir())) == len(taken)
 
 
-def test_stop_lets_the_camera_go(camera, opened):
-    camera.send(*range(8))
-    source = opened()
-    assert numbers(source, list(source.arriving(0, 3, 1))) == [0, 1, 2]
-    camera.send(*range(8, 12))  # the thread may be waiting for one
-    wait_until(lambda: not source._thread.is_alive())
-    assert len(source) == 3
-    assert len(source.notes) == 1, "the end was asked for"
-
-
 def test_a_pause_beyond_the_patience_ends_the_recording_and_is_told(camera, opened, monkeypatch):
     monkeypatch.setattr(live, "PATIENCE", 2.0)
     camera.send(*range(6))
@@ -204,70 +174,6 @@ def test_ctrl_c_ends_the_recording_and_a_second_one_interrupts(camera, opened):
         time.sleep(PATIENCE)
 
 
-def test_ctrl_c_after_the_end_of_the_stream_interrupts(camera, opened):
-    camera.send(*range(6))
-    source = opened()
-    assert len(list(source.arriving(0, 4, 1))) == 4
-    with pytest.raises(KeyboardInterrupt):
-        os.kill(os.getpid(), signal.SIGINT)
-        time.sleep(PATIENCE)
-
-
-def test_closing_gives_ctrl_c_back(camera, opened):
-    before = signal.getsignal(signal.SIGINT)
-    camera.send(*range(6))
-    source = opened()
-    assert signal.getsignal(signal.SIGINT) != before
-    camera.end()
-    source.close()
-    assert signal.getsignal(signal.SIGINT) == before
-
-
-def test_process_that_forgets_to_close_ends_cleanly(camera):
-    code = (
-        "import sys; from modp_ti.inputs.sources.live import LiveSource; source = LiveSource(sys.argv[1]); "
-        "print(next(source.arriving(0, None, 1))); print(source._kept.name)"
-    )
-    camera.send(*range(40))
-    result = subprocess.run([sys.executable, "-c", code, camera.url], capture_output=True, text=True, check=True)
-    assert result.stderr == ""
-    name, folder = result.stdout.split()
-    assert name == "live_000000" and not Path(folder).exists()
-
-
-def test_passwords_are_not_shown(camera, opened):
-    camera.send(*range(6))
-    source = opened()
-    assert str(source.path).endswith("/stream.mjpg") and str(source.path).startswith("127.0.0.1:")
-    assert "secret" not in " ".join(source.notes)
-
-
-def test_past_frames_are_asked_of_it_in_vain_before_any_was_taken(camera, opened):
-    camera.send(*range(6))
-    with pytest.raises(InputError, match="a live source has no past frames: take a tracker that follows it"):
-        opened().selected(0, None, 1)
-
-
-def test_given_intrinsics_are_for_the_streams_size(camera):
-    camera.send(*range(6))
-    settings = SourceSettings(stream=camera.url, intrinsics=IntrinsicsSettings(fx=70.0))
-    source = open_source(settings)
-    camera.end()
-    source.close()
-    assert source.intrinsics is not None
-    assert (source.intrinsics.camera.cx, source.intrinsics.camera.height) == (32.0, 48)
-
-
-def test_intrinsics_of_another_size_let_the_camera_go(camera):
-    threads = threading.active_count()
-    camera.send(*range(6))
-    camera.end()
-    settings = SourceSettings(stream=camera.url, intrinsics=IntrinsicsSettings(fx=70.0, width=640, height=480))
-    with pytest.raises(InputError, match=r"source\.intrinsics are for 640x480, the images are 64x48"):
-        open_source(settings)
-    wait_until(lambda: threading.active_count() <= threads)
-
-
 def test_full_disk_is_said_in_one_line(camera, opened, monkeypatch):
     camera.send(*range(6))
     source = opened()
@@ -287,39 +193,8 @@ def test_full_disk_is_said_in_one_line(camera, opened, monkeypatch):
     assert source.notes[-1].startswith("the recording ended: ") and "No space left" in source.notes[-1]
 
 
-def test_room_for_the_map_is_kept_on_the_disk(camera, opened, monkeypatch):
-    camera.send(*range(6))
-    source = opened()
-    arriving = source.arriving(0, None, 1)
-    taken = [next(arriving), next(arriving)]
-    monkeypatch.setattr(process, "KEPT_FREE", 1 << 60)
-    assert list(arriving) == [] and list(source.names) == taken
-    said = f"{source._store.folder.parent}: less than 1 GiB is free for the frames of the live source; "
-    assert source.notes[-1].startswith(f"the recording ended: {said}")
-
-
-def test_a_tracker_without_a_map_says_that_the_disk_was_full(camera, opened, monkeypatch):
-    camera.send(*range(6))
-    source = opened(time.monotonic)
-    tracker = open_klt(SourceSettings(stream=camera.url), images=source)
-    arriving = iter(tracker)
-    monkeypatch.setattr("modp_ti.inputs.sources.frame_store.has_room", lambda *_: len(source.names) < 3)
-    with pytest.raises(
-        InputError, match=r"none of the 3 images before the recording ended \(.*less than 1 GiB is free"
-    ):
-        list(arriving)
-
-
-@pytest.mark.parametrize(
-    ("stream", "message"),
-    [
-        (99, "camera 99: no such camera, or it is in use (source.stream)"),
-        ("98", "camera 98: no such camera, or it is in use (source.stream)"),
-        ("http://user:secret@127.0.0.1:1/x", "127.0.0.1:1/x: no stream that can be opened (source.stream)"),
-        (__file__, f"{__file__}: is a file (source.stream): give it as source.path"),
-    ],
-)
-def test_stream_that_is_not_there_is_named(stream, message):
+@pytest.mark.parametrize("stream", [99, "98", "http://user:secret@127.0.0.1:1/x", __file__])
+def test_a_stream_that_is_not_there_is_an_error_without_its_password(stream):
     with pytest.raises(InputError) as caught:
         LiveSource(stream)
-    assert str(caught.value) == message
+    assert "\n" not in str(caught.value) and "secret" not in str(caught.value)

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import pytest
 
-from modp_ti.inputs.sources import ImageFolder
 from modp_ti.inputs.sources.image_folder import times_of_names
 
 
@@ -32,12 +30,3 @@ def test_nanoseconds_microseconds_milliseconds_and_seconds_are_told_apart():
 )
 def test_other_names_are_no_times(names):
     assert times_of_names(names) is None
-
-
-def test_a_folder_of_such_images_has_their_times_and_says_so(tmp_path):
-    for name in ("1403636579763555584.png", "1403636579813555456.png"):
-        cv2.imwrite(str(tmp_path / name), np.zeros((4, 5, 3), np.uint8))
-    images = ImageFolder(tmp_path, fps=10.0)
-    assert images.timestamp(images.names[0]) == pytest.approx(1403636579.763555584, abs=3e-7)
-    assert images.timestamp(images.names[1]) - images.timestamp(images.names[0]) == pytest.approx(0.05, abs=1e-6)
-    assert "names are taken as their times" in images.notes[0]

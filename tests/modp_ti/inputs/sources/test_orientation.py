@@ -11,9 +11,6 @@ from numpy.typing import NDArray
 from PIL import Image, ImageOps
 
 from fields.geometry.camera import PinholeCamera
-from modp_ti.config.settings import IntrinsicsSettings, SourceSettings
-from modp_ti.files.errors import InputError
-from modp_ti.inputs.opening import open_source
 from modp_ti.inputs.sources import Distortion, ImageFolder
 from modp_ti.inputs.sources.orientation import Turn, turn_of_exif
 
@@ -80,15 +77,6 @@ def test_images_of_several_sizes_are_turned_one_by_one(tmp_path):
         assert images.size(name) == (48, 32)
         assert np.abs(images.read(name).astype(int) - STORED).mean() < 3.0
     assert len(images.notes) == 1 and "7 of 8 images" in images.notes[0]
-
-
-def test_given_intrinsics_are_for_the_upright_image(tmp_path):
-    write(tmp_path / "a.jpg", STORED, 6)
-    upright = IntrinsicsSettings(fx=40.0, width=32, height=48)
-    camera = open_source(SourceSettings(path=tmp_path, intrinsics=upright)).intrinsics
-    assert camera is not None and (camera.camera.cx, camera.camera.cy) == (16.0, 24.0)
-    with pytest.raises(InputError, match="48x32, the images are 32x48"):
-        open_source(SourceSettings(path=tmp_path, intrinsics=IntrinsicsSettings(fx=40.0, width=48, height=32)))
 
 
 @pytest.mark.parametrize("quarters", range(4))

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from modp_ti.config.settings import SceneConfig, SourceSettings
+from modp_ti.config.settings import SourceSettings
 from modp_ti.inputs.opening import open_source
 from modp_ti.inputs.sources import ImageFolder
 from modp_ti.inputs.sources.paced import PacedSource
@@ -103,22 +103,7 @@ def test_finish_ends_it_after_what_has_arrived(folder):
     assert list(arriving) == ["002.png", "003.png"]
 
 
-def test_waiting_ends_when_it_is_finished(folder):
-    source = PacedSource(ImageFolder(folder, fps=1e-3))
-    arriving = source.arriving(0, None, 1)
-    next(arriving)
-    source.finish()
-    assert list(arriving) == [], "without 1000 s of waiting"
-
-
 def test_the_setting_opens_it_with_the_camera_and_the_scale(folder):
     source = open_source(SourceSettings(path=folder, realtime=True, scale=0.5, intrinsics={"fx": 15.0}))
     assert isinstance(source, PacedSource)
     assert (source.intrinsics.camera.fx, source.scale, source.frame_size) == (15.0, 0.5, (16, 12))
-
-
-def test_a_scene_can_be_read_without_its_clock():
-    settings = {"source": {"path": "x", "realtime": True}, "tracker": {"kind": "klt"}, "output": "out"}
-    config = SceneConfig.model_validate(settings)
-    assert config.is_realtime and not config.can_be_resumed
-    assert not config.without_clock().is_realtime and config.without_clock().can_be_resumed

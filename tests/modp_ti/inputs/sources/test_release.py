@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from modp_ti.config.settings import SourceSettings
-from modp_ti.files.errors import InputError
 from modp_ti.inputs.opening import open_source
 from modp_ti.inputs.sources import FrameReader
 
@@ -47,19 +46,3 @@ def test_its_vignette_comes_with_the_frames_unless_another_is_given(release, tmp
     assert made.vignette is None
     picture = FrameReader(made, settings).read("2.png", made.intrinsics.undistorter(1.0))
     assert picture.vignette.min() == 1.0
-
-
-def test_black_or_missing_parts_are_named(release, tmp_path):
-    (release / "vignette.png").write_bytes(b"no image")
-    with pytest.raises(InputError, match=r"vignette\.png: the vignette is no image"):
-        open_source(SourceSettings(path=release))
-    with pytest.raises(InputError, match=r"nothing/rectified: no such folder: source\.path must be a sequence of the"):
-        open_source(SourceSettings(path=tmp_path / "nothing", kind="release"))
-
-
-def test_vignette_of_another_shape_is_refused_when_the_run_begins(release):
-    cv2.imwrite(str(release / "vignette.png"), np.full((300, 400), 255, np.uint8))
-    settings = SourceSettings(path=release)
-    made = open_source(settings)
-    with pytest.raises(InputError, match=r"the vignette of .*rectified is 400x300, the images are 800x800"):
-        FrameReader(made, settings).require_fitting([("2.png", made.intrinsics.undistorter(1.0))])

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-import pytest
 
 from modp_ti.config.settings import SourceSettings
-from modp_ti.files.errors import InputError
 from modp_ti.inputs.opening import open_source
 from modp_ti.inputs.sources import require_intrinsics
 
@@ -30,19 +28,3 @@ def test_colour_images_are_listed_with_the_data_sets_camera(tmp_path):
     # cx 599.5 with pixel centres at whole numbers is the middle: half of the image's width where they lie at +0.5.
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (600, 600, 1200 / 2, 680 / 2)
     assert made.notes == [f"{tmp_path} is read as what `source.kind: replica` says"]
-
-
-def test_camera_is_not_that_of_images_of_another_size(tmp_path):
-    made = open_source(SourceSettings(path=room(tmp_path, 600, 340), kind="replica"))
-    assert made.notes[0].startswith(
-        f"{tmp_path / 'results'}: the images are 600x340, the data set's camera 1200x680: give source.intrinsics"
-    )
-    with pytest.raises(InputError, match=r"the camera is not known: give source\.intrinsics"):
-        require_intrinsics(made)
-
-
-def test_folder_without_colour_images_is_named(tmp_path):
-    (tmp_path / "results").mkdir()
-    cv2.imwrite(str(tmp_path / "results" / "depth000000.png"), np.zeros((8, 8), np.uint16))
-    with pytest.raises(InputError, match=r"results: holds no frame000000\.jpg"):
-        open_source(SourceSettings(path=tmp_path, kind="replica"))

@@ -7,9 +7,7 @@ import numpy as np
 import pytest
 
 from modp_ti.config.settings import SourceSettings
-from modp_ti.files.errors import InputError
 from modp_ti.inputs.opening import open_source
-from modp_ti.inputs.sources import require_intrinsics
 
 
 def sequence(folder, *names):
@@ -31,25 +29,6 @@ def test_colour_images_are_taken_alone_and_timed_by_their_number(tmp_path, insid
     camera = made.intrinsics.camera
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (525, 525, 320, 240)
     assert made.notes == [f"{tmp_path} is read as what `source.kind: sevenscenes` says"]
-
-
-def test_a_tracker_that_relies_on_the_nominal_camera_says_so(tmp_path):
-    sequence(tmp_path, *NAMES)
-    made = open_source(SourceSettings(path=tmp_path, scale=1.0))
-    assert require_intrinsics(made) is made.intrinsics
-    assert "nominal intrinsics (f = 525 px, no distortion)" in made.notes[-1]
-
-
-def test_same_number_twice_is_named(tmp_path):
-    sequence(tmp_path, "frame-000002.color.png", "frame-000002.color.jpg")
-    with pytest.raises(InputError, match=r"frame-000002\.color\.jpg has the same frame number"):
-        open_source(SourceSettings(path=tmp_path))
-
-
-def test_scene_of_several_sequences_asks_for_one(tmp_path):
-    sequence(tmp_path / "seq-01", *NAMES)
-    with pytest.raises(InputError, match="nor does its folder images; give one of its sequences, such as seq-01"):
-        open_source(SourceSettings(path=tmp_path, kind="sevenscenes"))
 
 
 def test_real_sequence(shared_data):

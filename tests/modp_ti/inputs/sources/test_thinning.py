@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from modp_ti.inputs.sources import backlog as backlogs
-from modp_ti.inputs.sources.backlog import Backlog, Thinning
+from modp_ti.inputs.sources.backlog import Backlog
 
 
 def played(
@@ -98,30 +98,6 @@ def test_keyframes_that_hold_up_the_tracker_leave_no_hole(slower, least):
     assert max(ages) < 1.5
 
 
-@pytest.mark.parametrize("slower", [1.0, 1.5])
-def test_keyframes_leave_no_gap_in_a_slow_stream(slower):
-    numbers: list[int] = []
-    _, ages, _ = played(at(10, 100), klt_costs(numbers, slower), numbers)
-    assert numbers == list(range(1000))
-    assert max(ages) < 1.1
-
-
-@pytest.mark.parametrize("slower", [1.0, 1.25, 1.5])
-def test_a_second_spent_on_the_camera_leaves_no_gap_above_the_largest(slower):
-    """An unknown camera is estimated at the 12th, 24th and 48th keyframe; until then they come every fourth frame."""
-    numbers: list[int] = []
-
-    def cost(i: int) -> float:
-        if i == 0:
-            return 1.0
-        made = range(numbers[i - 1] // 4, min(numbers[i] // 4, 200))
-        return slower * (0.017 + sum(0.06 + {12: 0.2, 24: 0.4, 48: 1.1}.get(k, 0.0) for k in made))
-
-    _, ages, _ = played(at(30, 20), cost, numbers)
-    assert np.diff(numbers).max() / 30 <= 0.15
-    assert max(ages) < 4.0
-
-
 def test_a_tracker_that_is_much_too_slow_stays_within_two_seconds():
     numbers: list[int] = []
     _, ages, _ = played(at(30, 1000 / 30), klt_costs(numbers, 2.0), numbers)
@@ -143,19 +119,6 @@ def test_uneven_costs_and_arrivals_leave_no_long_gap_and_no_lag(rate, mean):
         assert gaps.max() == 1
 
 
-def test_a_hiccup_of_a_second_is_absorbed():
-    numbers, ages, _ = played(at(10, 30), lambda i: 1.0 if i == 100 else 0.06)
-    assert numbers == list(range(300))
-    assert max(ages[130:]) < 0.001
-
-
-def test_a_second_of_expensive_frames_thins_nothing_if_the_tracker_keeps_up_on_average():
-    # klt on the demo at 25 frames a second: a second in which it takes longer than a frame lasts, the rest is cheap.
-    numbers, ages, _ = played(at(25, 8), lambda i: 0.046 if 105 <= i < 130 else 0.028)
-    assert numbers == list(range(200))
-    assert 0.1 < max(ages) < 0.4
-
-
 def test_the_backlog_of_a_long_pause_is_worked_off_with_fewer_frames_evenly():
     numbers, ages, _ = played(at(10, 60), lambda i: 8.0 if i == 100 else 0.06)
     gaps = np.diff(numbers)
@@ -167,47 +130,12 @@ def test_the_backlog_of_a_long_pause_is_worked_off_with_fewer_frames_evenly():
     assert set(gaps[caught_up:]) == {1}
 
 
-def test_the_time_in_which_the_tracker_is_opened_thins_nothing():
-    numbers, _, _ = played(at(10, 30), lambda i: 1.0 if i == 0 else 0.06)
-    assert numbers == list(range(300))
-
-
 def test_a_pause_of_the_stream_changes_nothing():
     whole = at(30, 40)
     numbers, _, _ = played(whole, lambda _: 0.06)
     paused, _, _ = played([t if t < 20 else t + 5.0 for t in whole], lambda _: 0.06)
     assert len(paused) == pytest.approx(len(numbers), abs=5)
     assert np.diff(paused).max() == 2
-
-
-def test_what_a_network_held_back_is_thinned_evenly_when_it_comes_at_once():
-    arrivals = [t if t < 20 else max(t, 25.0 + (t - 20.0) / 100) for t in at(30, 60)]
-    numbers, ages, _ = played(arrivals, lambda _: 0.06)
-    assert np.diff(numbers).max() <= 8
-    assert max(ages[-300:]) < 0.2
-
-
-def test_the_mean_stride_is_what_the_tracker_needs():
-    policy = Thinning()
-    for i in range(40):
-        policy.arrived(i / 100)
-        policy.tracked(0.0325)
-    strides = [policy.stride(0.0) for _ in range(100)]
-    assert set(strides) == {3, 4}
-    assert sum(strides) / 100 == pytest.approx(3.25 * 1.05, abs=0.02)
-    assert max(abs(sum(strides[i : i + 10]) - 34) for i in range(90)) <= 1, "evenly"
-    for _ in range(200):
-        policy.tracked(0.005)
-    assert [policy.stride(0.0) for _ in range(9)] == [1] * 9
-
-
-def test_a_lag_does_not_widen_the_gaps_beyond_the_largest_before_it_is_long():
-    policy = Thinning()
-    for i in range(300):
-        policy.arrived(i / 30)
-        policy.tracked(0.07)
-    for lag, most in ((0.0, 3), (0.5, 3), (1.2, 4), (2.0, 7), (20.0, 8)):
-        assert max(policy.stride(lag) for _ in range(20)) <= most
 
 
 def test_too_many_waiting_frames_are_halved_evenly(monkeypatch):
@@ -225,14 +153,6 @@ def test_too_many_waiting_frames_are_halved_evenly(monkeypatch):
     backlog.clear()
     assert len(backlog) == 0
     assert backlog.arrivals.arrived == backlog.arrivals.thinned
-
-
-def test_frames_are_not_left_out_before_the_first_is_taken():
-    backlog: Backlog[int] = Backlog()
-    for i in range(5):
-        backlog.add(0.1 * i, i)
-    assert backlog.take(100.0) == (0.0, 0)
-    assert backlog.take(100.1) == (0.1, 1)
 
 
 def taken_and_decoded(rate: int, every: bool) -> tuple[list[int], int]:

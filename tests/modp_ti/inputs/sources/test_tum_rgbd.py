@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from modp_ti.config.settings import SourceSettings
-from modp_ti.files.errors import InputError
 from modp_ti.inputs.opening import open_source
 from modp_ti.inputs.readers.tum import TumSettings
 
@@ -72,41 +71,3 @@ def test_camera_that_nothing_tells_is_asked_for(sequence, folder):
     made = opened(sequence(LISTING, folder))
     assert made.intrinsics is None
     assert "give source.intrinsics" in made.notes[-1]
-
-
-@pytest.mark.parametrize(
-    ("listing", "message"),
-    [
-        ("10.25 rgb/10.25.png\n10.5\n", r"rgb\.txt:2: must be a time stamp and a path, not '10\.5'"),
-        ("# x\nnow rgb/10.25.png\n", r"rgb\.txt:2: the time stamp 'now' is no finite number"),
-        ("nan rgb/10.25.png\n", r"rgb\.txt:1: the time stamp 'nan' is no finite number"),
-        ("10.75 rgb/10.75.png\n10.25 rgb/10.25.png\n", r"rgb\.txt:2: time stamp 10\.25 is not later than the one"),
-        ("10.25 rgb/10.25.png\n\n10.75 rgb/10.25.png\n", r"rgb\.txt:3: rgb/10\.25\.png is listed before, in line 1"),
-        ("# nothing\n", r"rgb\.txt: lists no image"),
-        ("1.0 rgb/1.0.png\n2.0 rgb/2.0.png\n", r"none of its 2 images is there, the first is rgb/1\.0\.png"),
-    ],
-)
-def test_faulty_listing_is_named_by_file_and_line(sequence, listing, message):
-    with pytest.raises(InputError, match=message) as caught:
-        opened(sequence(listing))
-    assert "\n" not in str(caught.value)
-
-
-def test_missing_or_binary_listing_is_named(sequence):
-    folder = sequence(LISTING)
-    (folder / "rgb.txt").write_bytes(b"\xff\x00\x81")
-    with pytest.raises(InputError, match=r"rgb\.txt: cannot be read as text: .*; it should list the images"):
-        opened(folder)
-    (folder / "rgb.txt").unlink()
-    with pytest.raises(InputError, match=r"rgb\.txt: no such file; it should list the images"):
-        open_source(SourceSettings(path=folder, kind="tum_rgbd"))
-
-
-def test_real_listing_names_files_that_are_not_there(shared_data):
-    made = open_source(SourceSettings(path=shared_data("tum_fr1_desk")))
-    assert len(made) == 9
-    assert made.notes[1].startswith("604 of the 613 images")
-    assert made.intrinsics.camera.fx == 517.3
-    for name in made.names:
-        assert name == f"rgb/{made.timestamp(name):.6f}.png"
-        assert made.read(name).shape == (480, 640, 3)

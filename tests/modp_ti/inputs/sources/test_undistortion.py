@@ -87,13 +87,6 @@ def test_mask_holds_exactly_the_pixels_that_the_photograph_covers(model):
         assert not mask.flags.writeable
 
 
-def test_some_lens_leaves_uncovered_pixels_and_some_does_not():
-    undistorter, _ = made("OPENCV", 1.0)
-    assert undistorter.image(np.zeros((HEIGHT, WIDTH, 3), np.uint8))[1] is not None
-    undistorter, _ = made("SIMPLE_RADIAL", 1.0)
-    assert undistorter.image(np.zeros((HEIGHT, WIDTH, 3), np.uint8))[1] is None
-
-
 def test_pixels_beyond_the_fold_of_a_lens_polynomial_are_masked():
     undistorter = Undistorter(PinholeCamera(200, 200, 200, 150, 400, 300), Distortion((-0.3,)))
     _, mask = undistorter.image(np.zeros((300, 400, 3), np.uint8))
@@ -124,11 +117,6 @@ def test_each_axis_follows_its_exact_ratio():
     assert Undistorter(camera, scale=0.0001).camera.width == 1
 
 
-def test_image_of_another_size_is_a_mistake_of_the_caller():
-    with pytest.raises(ValueError, match="64x48"):
-        Undistorter(PinholeCamera(50, 50, 32, 24, 64, 48)).image(np.zeros((64, 48, 3), np.uint8))
-
-
 @pytest.mark.parametrize("model", ["SIMPLE_RADIAL", "OPENCV"])
 def test_an_image_of_a_guessed_camera_becomes_that_of_the_camera_that_is_found(model):
     found, oracle = made(model, 0.5)
@@ -146,16 +134,3 @@ def test_an_image_of_a_guessed_camera_becomes_that_of_the_camera_that_is_found(m
     assert revision.camera == found.camera
     raw = np.random.default_rng(0).uniform([40, 40], [WIDTH - 40, HEIGHT - 40], (500, 2))
     np.testing.assert_allclose(revision.pixels(guess.points(raw)), found.points(raw), atol=0.05)
-
-
-def test_another_focal_length_alone_leaves_the_image_as_it_is():
-    a, b = (Undistorter(PinholeCamera(f, f, 320.0, 240.5, WIDTH, HEIGHT), scale=0.5) for f in (540.0, 500.0))
-    revision, rgba = b.revising(a), np.random.default_rng(1).integers(0, 255, (4, 5, 4)).astype(np.uint8)
-    assert revision.lookup is None and revision.image(rgba) is rgba
-    pixels = np.array([[3.0, 7.0], [100.0, 20.0]])
-    np.testing.assert_array_equal(revision.pixels(pixels), pixels)
-    points = np.array([[0.3, -0.2, 2.0], [0.1, 0.4, 5.0], [0.1, 0.1, -1.0]])
-    moved = revision.points(points, a.camera)
-    np.testing.assert_allclose(b.camera.project(moved[:2]), a.camera.project(points[:2]), atol=1e-9)
-    np.testing.assert_array_equal(moved[:, 2], points[:, 2])
-    np.testing.assert_array_equal(moved[2], points[2])

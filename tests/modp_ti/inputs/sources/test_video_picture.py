@@ -105,13 +105,6 @@ def test_frames_are_turned_and_mirrored_as_the_file_asks(tmp_path, degrees, mirr
     assert len(video.notes) == (degrees != 0 or mirrored)
 
 
-def test_a_slanted_video_is_said_and_not_turned(tmp_path):
-    file = write(tmp_path / "a.mp4", "libx264", pictures(), lambda s: s.set_display_rotation(-30), pix_fmt="yuv420p")
-    video = VideoFile(file)
-    assert video.size("a_000000") == (WIDTH, HEIGHT)
-    assert "30 degrees" in video.notes[0]
-
-
 @pytest.mark.parametrize("suffix", ["mp4", "mkv"])
 def test_frames_of_varying_rate_have_their_own_times(tmp_path, suffix):
     times = np.array([0, 33, 70, 200, 210, 500])  # [ms]
