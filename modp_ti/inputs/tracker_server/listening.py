@@ -1,16 +1,17 @@
-"""The listening socket (Unix or TCP), and the accepted connections that have not sent anything yet."""
+"""The listening socket (Unix or TCP), its idle connections, and the one to the sender, which reads whole messages."""
 
 from __future__ import annotations
 
 import ipaddress
 import selectors
 import socket
-import stat
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from threading import Event
 
 from modp_ti.files.errors import InputError
+from modp_ti.inputs.tracker_server.messages import HEADER, Hello, Kind, ProtocolError, encoded, parse_header
 
 DEFAULT_ADDRESS = "127.0.0.1:7007"
 # Largest size of a Unix socket's path in bytes.
@@ -21,6 +22,14 @@ WAITING = 8
 HELLO_PATIENCE = 30.0
 # Idle connections that are kept. If there are more, the oldest are closed.
 MAX_SILENT = 16
+# Timeout [s] for the first message after its first byte, so that a stalled client does not block a tracker.
+FIRST_PATIENCE = 5.0
+# Time [s] for which input is still read and discarded after an error. Closing a socket with unread input resets the
+# connection, and the sender would lose the error message.
+DRAIN_SECONDS = 1.0
+# Interval [s] at which waiting threads check whether they should stop.
+GLANCE = 0.2
+CHUNK = 1 << 20
 
 
 def listen(address: str | None, path: Path | None) -> tuple[socket.socket, str]:
@@ -38,9 +47,15 @@ def listen(address: str | None, path: Path | None) -> tuple[socket.socket, str]:
     """
     if path is not None:
         return _at_path(path), f"unix:{path}"
-    host, port = _parts(address or DEFAULT_ADDRESS)
+    address = address or DEFAULT_ADDRESS
+    host, colon, port = address.rpartition(":")
+    host = host.removeprefix("[").removesuffix("]")
+    if not colon or not host or not port.isdecimal() or int(port) > 65535:
+        raise InputError(f"tracker.address: write it as host:port, for example {DEFAULT_ADDRESS}, not {address}")
     try:
-        family, _, _, _, where = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
+        family, _, _, _, where = socket.getaddrinfo(host, int(port), type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[
+            0
+        ]
         listener = socket.socket(family, socket.SOCK_STREAM)
     except OSError as error:
         raise InputError(f"tracker.address {address}: no such address of this machine: {error.strerror}") from None
@@ -51,7 +66,7 @@ def listen(address: str | None, path: Path | None) -> tuple[socket.socket, str]:
     except OSError as error:
         listener.close()
         raise InputError(
-            f"tracker.address {address or DEFAULT_ADDRESS}: cannot listen there: {error.strerror}; "
+            f"tracker.address {address}: cannot listen there: {error.strerror}; "
             "take another port or end the program that has it"
         ) from None
     host, port = listener.getsockname()[:2]
@@ -65,18 +80,17 @@ def open_to_others(listener: socket.socket) -> bool:
     return not ipaddress.ip_address(listener.getsockname()[0]).is_loopback
 
 
-def _parts(address: str) -> tuple[str, int]:
-    host, colon, port = address.rpartition(":")
-    host = host.removeprefix("[").removesuffix("]")
-    if not colon or not host or not port.isdecimal() or int(port) > 65535:
-        raise InputError(f"tracker.address: write it as host:port, for example {DEFAULT_ADDRESS}, not {address}")
-    return host, int(port)
-
-
 def _at_path(path: Path) -> socket.socket:
+    """Listen at a path, where at most a socket is that nobody listens at any more."""
     if len(str(path).encode()) > MAX_SOCKET_PATH:
         raise InputError(f"{path}: a Unix socket's path has at most {MAX_SOCKET_PATH} bytes (tracker.path)")
-    _remove_left_over(path)
+    if path.exists() and not path.is_socket():
+        raise InputError(f"{path}: is there already and no socket; tracker.path must name a new one")
+    if path.is_socket():
+        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+            if probe.connect_ex(str(path)) == 0:
+                raise InputError(f"{path}: another program listens there (tracker.path)")
+        path.unlink(missing_ok=True)
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
         listener.bind(str(path))
@@ -86,23 +100,6 @@ def _at_path(path: Path) -> socket.socket:
         listener.close()
         raise InputError(f"{path}: cannot listen there: {error.strerror} (tracker.path)") from None
     return listener
-
-
-def _remove_left_over(path: Path) -> None:
-    """Delete a stale socket. Raises InputError if a program listens there or the path is another kind of file."""
-    try:
-        mode = path.lstat().st_mode
-    except OSError:
-        return
-    if not stat.S_ISSOCK(mode):
-        raise InputError(f"{path}: is there already and no socket; tracker.path must name a new one")
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
-        try:
-            probe.connect(str(path))
-        except OSError:
-            path.unlink(missing_ok=True)
-            return
-    raise InputError(f"{path}: another program listens there (tracker.path)")
 
 
 class Lobby:
@@ -176,3 +173,111 @@ class Lobby:
     def _forget(self, sock: socket.socket) -> None:
         self._selector.unregister(sock)
         del self._silent[sock]
+
+
+class SenderGoneError(Exception):
+    """The connection has ended or timed out. The text says how, in one line."""
+
+
+class OthersSpeakError(Exception):
+    """The sender is silent between two messages, and another one is not."""
+
+
+class Connection:
+    """Reads messages from a connected socket.
+
+    Args:
+        sock: The socket.
+        patience: Timeout [s] for each whole message.
+        closed: Set by another thread to stop reading.
+
+    Attributes:
+        socket: As the argument.
+        hello: Payload of the HELLO, kept by the caller.
+    """
+
+    def __init__(self, sock: socket.socket, patience: float, closed: Event) -> None:
+        self.socket = sock
+        self.hello: bytes | None = None
+        self._patience = patience
+        self._closed = closed
+        self._reset = False
+
+    def receive(self, hello: Hello | None, others: Callable[[], bool] = lambda: False) -> tuple[Kind, bytes]:
+        """Read the next message. Its header is checked before the payload is read.
+
+        Args:
+            hello: The connection's HELLO; None before it.
+            others: Returns whether another sender waits with something to say.
+
+        Returns:
+            The message's kind and payload.
+
+        Raises:
+            ProtocolError: If the header is invalid.
+            SenderGoneError: If the connection ends or times out.
+            OthersSpeakError: If `others` does, and this sender is silent.
+        """
+        patience = self._patience if hello else min(self._patience, FIRST_PATIENCE)
+        deadline = time.monotonic() + patience
+        kind, length = parse_header(self._read(HEADER.size, deadline, patience, False, others), hello)
+        return kind, self._read(length, deadline, patience, True, others)
+
+    def _read(self, size: int, deadline: float, patience: float, begun: bool, others: Callable[[], bool]) -> bytes:
+        data, heard = bytearray(), time.monotonic()
+        while len(data) < size:
+            if self._closed.is_set():
+                raise SenderGoneError("the sender is let go: the run is over")
+            left = deadline - time.monotonic()
+            try:
+                self.socket.settimeout(min(max(left, 0.001), GLANCE))
+                part = self.socket.recv(min(size - len(data), CHUNK))
+            except TimeoutError:
+                if left > 0 and others():
+                    if not begun and not data:
+                        raise OthersSpeakError from None
+                    if time.monotonic() - heard > FIRST_PATIENCE:
+                        left, patience = 0.0, FIRST_PATIENCE
+                if left > 0:
+                    continue
+                where = "in mid-message" if begun or data else "without a message"
+                raise SenderGoneError(f"the sender was silent for {patience:g} s {where}") from None
+            except ConnectionResetError:
+                # A sender that exits without reading WELCOME causes one reset. What it sent may still be readable.
+                if self._reset:
+                    raise SenderGoneError("the sender is gone: the connection was reset") from None
+                self._reset = True
+                continue
+            except OSError as error:
+                raise SenderGoneError(f"the sender is gone: {error.strerror or error}") from None
+            if not part:
+                raise SenderGoneError(
+                    "the sender ended in mid-message" if begun or data else "the sender ended without END"
+                )
+            data += part
+            heard = time.monotonic()
+        return bytes(data)
+
+    def say(self, kind: Kind, payload: bytes = b"") -> None:
+        """Send a message. Errors are ignored, because the sender need not read replies."""
+        try:
+            self.socket.settimeout(DRAIN_SECONDS)
+            self.socket.sendall(encoded(kind, payload))
+        except OSError:
+            pass
+
+    def refuse(self, reason: str | ProtocolError) -> None:
+        """Send the reason as a one-line ERROR and close the connection."""
+        self.say(Kind.ERROR, " ".join(str(reason).split()).encode())
+        deadline = time.monotonic() + DRAIN_SECONDS
+        try:
+            self.socket.shutdown(socket.SHUT_WR)
+            while time.monotonic() < deadline and self.socket.recv(CHUNK):
+                pass
+        except OSError:
+            pass
+        self.close()
+
+    def close(self) -> None:
+        """Close the connection."""
+        self.socket.close()

@@ -88,11 +88,6 @@ class Encoding(IntEnum):
         """Bytes per pixel of a raw encoding; None for a file format."""
         return {Encoding.GREY8: 1, Encoding.RGB8: 3, Encoding.RGBA8: 4}.get(self)
 
-    def file(self, number: int) -> str:
-        """Name of the file in which the image of the frame with this number is stored."""
-        suffix = {Encoding.JPEG: ".jpg", Encoding.PNG: ".png"}.get(self, f".{self.name.lower()}")
-        return f"{number:06d}{suffix}"
-
 
 class State(IntEnum):
     """State of a frame's pose: sent later, known, or lost for good."""
@@ -129,6 +124,7 @@ class Frame:
         T_camera_world: (4, 4); None unless `state` is KNOWN.
         points: Points that the frame sees, in pixels of the image as sent.
         image: The bytes of the image as sent.
+        place: Place of the message's payload in the file of the stream.
     """
 
     number: int
@@ -137,6 +133,7 @@ class Frame:
     T_camera_world: NDArray[np.float64] | None
     points: SparsePoints
     image: bytes
+    place: int = 0
 
 
 @dataclass(frozen=True)
@@ -239,12 +236,13 @@ def parse_hello(payload: bytes) -> Hello:
     return Hello(Intrinsics(*intrinsics), Encoding(encoding), name)
 
 
-def parse_frame(payload: bytes, kind: Kind) -> Frame:
+def parse_frame(payload: bytes, kind: Kind, place: int = 0) -> Frame:
     """Parse the payload of a FRAME, or of a POSE, which has the same layout without an image.
 
     Args:
         payload: The payload.
         kind: FRAME or POSE.
+        place: As in `Frame`.
 
     Raises:
         ProtocolError: If sizes disagree, or the state is invalid here.
@@ -277,7 +275,7 @@ def parse_frame(payload: bytes, kind: Kind) -> Frame:
     except UnfitError as error:
         error.number = number
         raise
-    return Frame(number, state, timestamp, pose, points, payload[middle:])
+    return Frame(number, state, timestamp, pose, points, payload[middle:], place)
 
 
 def parse_points(block: bytes, what: str) -> SparsePoints:

@@ -1,20 +1,21 @@
-"""Storage of received images and points on disk, so that frames can be read again."""
+"""Storage of a received stream in one file, from which images and points are read again, and the stream itself."""
 
 from __future__ import annotations
 
 import io
+import os
 import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from fields.frames.tracked_frame import SparsePoints
 from fields.runtime.process import has_room
-from modp_ti.config.settings import SourceSettings
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.sources import FrameReader
 from modp_ti.inputs.sources.image_header import read_image_header, why_undecodable
@@ -22,6 +23,8 @@ from modp_ti.inputs.sources.image_pixels import decoded_as
 from modp_ti.inputs.sources.protocol import ImageSource
 from modp_ti.inputs.tracker_server.messages import (
     FRAME,
+    HEADER,
+    MAGIC,
     POINT,
     Encoding,
     Frame,
@@ -31,18 +34,25 @@ from modp_ti.inputs.tracker_server.messages import (
     encoded,
     parse_points,
 )
-from modp_ti.inputs.tracker_server.recorded_stream import FRAMES, STREAM
 
 if TYPE_CHECKING:
     from modp_ti.config.settings import SourceSettings
 
 
 class SpoolFullError(Exception):
-    """The disk has no space for another frame. The text is one line."""
+    """The disk has no space for another message. The text is one line."""
+
+
+def is_stream(path: Path | None) -> bool:
+    """Whether the path is a file that begins as a stream does."""
+    if path is None or not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(len(MAGIC)) == MAGIC
 
 
 class Spool(ImageSource):
-    """An `ImageSource` of the received images, stored in a temporary folder until `close`.
+    """An `ImageSource` of the received images. All messages are kept in a temporary file until `close`.
 
     Frames are named after the sender's frame numbers.
 
@@ -52,7 +62,7 @@ class Spool(ImageSource):
 
     Attributes:
         hello: As the argument.
-        stream: File of the messages, see `recorded_stream`.
+        stream: File of the messages, as they were received.
         undistorter: Undistorter of the images.
         reader: Reads and undistorts the images.
 
@@ -62,9 +72,8 @@ class Spool(ImageSource):
 
     def __init__(self, hello: Hello, source: SourceSettings) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix="modp-ti-server-")
-        frames = Path(self._folder.name, FRAMES)
-        frames.mkdir()
-        super().__init__(frames)
+        self.stream = Path(self._folder.name, "stream.modp")
+        super().__init__(self.stream)
         self.hello = hello
         self.intrinsics = hello.intrinsics
         self._size = (hello.intrinsics.camera.width, hello.intrinsics.camera.height)
@@ -73,76 +82,76 @@ class Spool(ImageSource):
         self.undistorter = hello.intrinsics.undistorter(self.scale)
         self.reader = FrameReader(self, source)
         self._encoding = hello.encoding
-        self.stream = self.path.with_name(STREAM)
-        self._stream = self.stream.open("wb", buffering=0)
+        self._file = self.stream.open("w+b", buffering=0)
+        self._end = 0  # size of the file in bytes
+        self._images: dict[str, tuple[int, int]] = {}  # place and size in the file
+        self._arrived: dict[str, float] = {}
         self._last: tuple[str, NDArray[np.uint8]] | None = None
-        self._received: dict[str, float] = {}
 
-    def keep(self, kind: Kind, payload: bytes) -> None:
-        """Add a message to the file of the stream. Raises SpoolFullError if the disk has no space."""
+    def keep(self, kind: Kind, payload: bytes) -> int:
+        """Add a message to the file; return the place of its payload. Raises SpoolFullError if there is no space."""
         message = encoded(kind, payload)
-        if kind is Kind.FRAME:
-            message = message[: -FRAME.unpack_from(payload)[-1] or None]
         try:
-            self._stream.write(message)
+            if not has_room(self.stream.parent, len(message)):
+                where = self.stream.parent.parent
+                raise SpoolFullError(f"{where}: less than 1 GiB is free for the frames that arrive; set TMPDIR")
+            os.pwrite(self._file.fileno(), message, self._end)
         except OSError as error:
-            raise self._full(error) from None
+            where = self.stream.parent.parent
+            raise SpoolFullError(f"{where}: a frame cannot be kept: {error.strerror}; set TMPDIR") from None
+        place = self._end + HEADER.size
+        self._end += len(message)
+        return place
 
     def add(self, frame: Frame) -> str:
-        """Store a frame's image.
-
-        Returns:
-            The name of the frame.
+        """Take in the image of a FRAME that is in the file, and return its name.
 
         Raises:
             UnfitError: If the image does not match HELLO or does not decode.
-            SpoolFullError: If the disk has no space.
         """
-        self._require_image(frame)
-        name = self.name(frame.number)
-        self._write(name, frame.image)
-        try:
-            self._decoded(name)
-        except InputError as error:
-            (self.path / name).unlink(missing_ok=True)
-            raise UnfitError(f"FRAME {frame.number}: {error}", frame.number) from None
-        self._received[name] = time.monotonic()
+        name, what = self.name(frame.number), f"FRAME {frame.number}"
+        problem = self._mismatch(frame.image)
+        if problem is None:
+            try:
+                self._last = name, self._decode(name, frame.image)
+            except InputError as error:
+                problem = str(error)
+        if problem is not None:
+            raise UnfitError(f"{what}: {problem}", frame.number)
+        self._images[name] = frame.place + FRAME.size + len(frame.points) * POINT.itemsize, len(frame.image)
+        self._arrived[name] = time.monotonic()
         self._append(name, frame.timestamp)
         return name
 
-    def received(self, name: str) -> float:
-        """`time.monotonic()` when the frame was received [s]."""
-        return self._received[name]
+    def points(self, place: int) -> SparsePoints:
+        """Read again the points of the FRAME or POSE whose payload is at this place in the file."""
+        count = FRAME.unpack(self._read(place, FRAME.size))[-2]
+        return parse_points(self._read(place + FRAME.size, count * POINT.itemsize), "the stream")
 
-    def arrived(self, name: str) -> float | None:
-        return self.received(name)
+    def arrived(self, name: str) -> float:
+        """Return `time.monotonic()` when the frame was received [s]."""
+        return self._arrived[name]
 
     def name(self, number: int) -> str:
-        """The name of the frame with this number."""
-        return self._encoding.file(number)
+        """Return the name of the frame with this number."""
+        suffix = {Encoding.JPEG: "jpg", Encoding.PNG: "png"}.get(self._encoding, self._encoding.name.lower())
+        return f"{number:06d}.{suffix}"
 
-    def _require_image(self, frame: Frame) -> None:
-        """Check encoding and size from the image's header, so that no image of another size is ever decoded."""
+    def _mismatch(self, image: bytes) -> str | None:
+        """Say how an image differs from HELLO, by its header, so that no image of another size is ever decoded."""
         width, height = self.frame_size
-        what = f"FRAME {frame.number}"
         if self._encoding.channels is not None:
             wanted = width * height * self._encoding.channels
-            if len(frame.image) != wanted:
-                raise UnfitError(f"{what}: its image has {len(frame.image)} bytes, HELLO says {wanted}", frame.number)
-            return
+            return None if len(image) == wanted else f"its image has {len(image)} bytes, HELLO says {wanted}"
         start = b"\xff\xd8" if self._encoding is Encoding.JPEG else b"\x89PNG"
-        header = read_image_header(io.BytesIO(frame.image)) if frame.image.startswith(start) else None
+        header = read_image_header(io.BytesIO(image)) if image.startswith(start) else None
         if header is None:
-            raise UnfitError(f"{what}: its image is no {self._encoding.name}", frame.number)
+            return f"its image is no {self._encoding.name}"
         if not header.complete:
-            raise UnfitError(f"{what}: its {self._encoding.name} image is cut off", frame.number)
+            return f"its {self._encoding.name} image is cut off"
         if (header.width, header.height) != (width, height):
-            raise UnfitError(
-                f"{what}: its image is {header.width}x{header.height}, HELLO says {width}x{height}",
-                frame.number,
-            )
-        if self._encoding is Encoding.JPEG and (reason := why_undecodable(frame.image)) is not None:
-            raise UnfitError(f"{what}: {reason}", frame.number)
+            return f"its image is {header.width}x{header.height}, HELLO says {width}x{height}"
+        return why_undecodable(image) if self._encoding is Encoding.JPEG else None
 
     def find(self, name: str) -> str | None:
         return name if name in self._position else None
@@ -165,20 +174,16 @@ class Spool(ImageSource):
         """Image (H, W, 3 or 4) uint8, RGB first. The last one is cached, since it is decoded to check it first."""
         last = self._last  # another thread may replace it
         if last is None or last[0] != name:
-            self._last = last = name, self._decode(name)
+            if name not in self._images:
+                raise InputError(f"{name}: no such frame was received")
+            self._last = last = name, self._decode(name, self._read(*self._images[name]))
         return last[1]
 
-    def _decode(self, name: str) -> NDArray[np.uint8]:
+    def _decode(self, name: str, data: bytes) -> NDArray[np.uint8]:
         width, height = self.frame_size
-        try:
-            data = (self.path / name).read_bytes()
-        except OSError as error:
-            raise InputError(f"{self.path / name}: the frame that was kept there is gone: {error.strerror}") from None
         if self._encoding.channels is not None:
             image = np.frombuffer(data, np.uint8).reshape(height, width, self._encoding.channels)
             return np.repeat(image, 3, axis=2) if image.shape[2] == 1 else image
-        import cv2
-
         # Same flags as ImageFolder for JPEG. PNG keeps its alpha channel.
         png = self._encoding is Encoding.PNG
         image = decoded_as(data, cv2.IMREAD_UNCHANGED if png else cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
@@ -188,30 +193,13 @@ class Spool(ImageSource):
         conversion = {1: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGBA}[channels]
         return np.asarray(cv2.cvtColor(image, conversion), dtype=np.uint8)
 
-    def keep_points(self, name: str, points: SparsePoints) -> None:
-        """Store the points of a delivered frame. Raises SpoolFullError if the disk has no space."""
-        table = np.zeros(len(points), dtype=POINT)
-        table["id"], table["xyz"], table["pixel"] = points.ids, points.xyz, points.pixels
-        self._write(name + ".points", table.tobytes())
-
-    def points(self, name: str) -> SparsePoints:
-        """Read the stored points of a frame."""
-        return parse_points((self.path / (name + ".points")).read_bytes(), name)
-
-    def _write(self, name: str, data: bytes) -> None:
-        try:
-            if not has_room(self.path, len(data)):
-                raise SpoolFullError(
-                    f"{self.path.parent.parent}: less than 1 GiB is free for the frames that arrive; set TMPDIR"
-                )
-            (self.path / name).write_bytes(data)
-        except OSError as error:
-            raise self._full(error) from None
-
-    def _full(self, error: OSError) -> SpoolFullError:
-        return SpoolFullError(f"{self.path.parent.parent}: a frame cannot be kept: {error.strerror}; set TMPDIR")
+    def _read(self, place: int, size: int) -> bytes:
+        data = os.pread(self._file.fileno(), size, place)
+        if len(data) < size:
+            raise InputError(f"{self.stream}: what was kept there is gone")
+        return data
 
     def close(self) -> None:
-        """Delete the temporary folder."""
-        self._stream.close()
+        """Delete the temporary file."""
+        self._file.close()
         self._folder.cleanup()

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
 from queue import Empty, Full, Queue
-from socket import socket
+from socket import SHUT_WR, create_connection, socket
 from threading import Event as Flag
 from threading import Thread
 from typing import TYPE_CHECKING, ClassVar
@@ -13,13 +16,20 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from fields.frames.pose_correction import PoseCorrection
-from fields.frames.tracked_frame import TrackedFrame
+from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.protocol import Event, LiveCounts, Progress, Tracker
 from modp_ti.inputs.replay import PosedImage, pictures_again, points_inside, tracked_frame
 from modp_ti.inputs.sources import Picture
-from modp_ti.inputs.tracker_server.connection import GLANCE, Connection, OthersSpeakError, SenderGoneError
-from modp_ti.inputs.tracker_server.listening import Lobby, listen, open_to_others
+from modp_ti.inputs.tracker_server.listening import (
+    GLANCE,
+    Connection,
+    Lobby,
+    OthersSpeakError,
+    SenderGoneError,
+    listen,
+    open_to_others,
+)
 from modp_ti.inputs.tracker_server.messages import (
     Correction,
     Frame,
@@ -32,20 +42,19 @@ from modp_ti.inputs.tracker_server.messages import (
     parse_hello,
 )
 from modp_ti.inputs.tracker_server.ordering import Ordering
-from modp_ti.inputs.tracker_server.recorded_stream import is_stream, send_again
-from modp_ti.inputs.tracker_server.spool import Spool, SpoolFullError
+from modp_ti.inputs.tracker_server.spool import Spool, SpoolFullError, is_stream
 
 if TYPE_CHECKING:
     from modp_ti.config.settings import SourceSettings
     from modp_ti.inputs.readers.socket import SocketSettings
 
-# What the server has received, in order; the images and points of frames are in the spool.
-_Waiting = PosedImage | PoseCorrection | InputError | None
+# What the server has received, in order; None at its end. Images and points of frames are in the spool.
+_Waiting = Frame | PoseCorrection | InputError | None
 
 # Pause [s] after a connection that failed before its first frame: BREATH times the number of such connections, at most
 # LONGEST_BREATH. Without it, a client that reconnects in a loop would keep a processor busy.
 BREATH, LONGEST_BREATH = 0.01, 0.5
-# Frames and corrections that wait for the mapper before the server reads slower. They wait on disk.
+# Frames and corrections that wait for the mapper before the server reads no more. They wait on disk.
 MAX_WAITING = 1000
 # Unusable messages that are skipped before the stream ends: FEW_UNFIT, plus UNFIT_SHARE of the frames received.
 FEW_UNFIT, UNFIT_SHARE = 3, 0.1
@@ -77,9 +86,8 @@ def open_tracker_server(
 class TrackerServer(Tracker):
     """A live `Tracker` that listens on a socket and delivers what another program sends.
 
-    A background thread reads and checks the messages, and stores images and points on disk. A second one decodes them
-    for the mapper, `source.prefetch` frames (at least one) ahead. When `MAX_WAITING` frames and corrections wait to be
-    decoded, the server stops reading, and the sender's writes block.
+    A background thread reads and checks the messages, and stores them on disk. Whoever iterates decodes their images.
+    When `MAX_WAITING` frames and corrections wait for it, the server stops reading, and the sender's writes block.
 
     A connection that fails before its first frame is dropped and counted in a note; the server keeps listening. Idle
     connections do not block an active sender. After the first frame, the end of the connection ends the stream, and the
@@ -94,6 +102,7 @@ class TrackerServer(Tracker):
         address: Where the server listens, as `host:port` or `unix:path`.
     """
 
+    reads_ahead: ClassVar[bool] = True
     corrects: ClassVar[bool] = True
 
     def __init__(self, source: SourceSettings, tracker: SocketSettings, progress: Progress | None = None) -> None:
@@ -112,7 +121,6 @@ class TrackerServer(Tracker):
         self._dropped, self._dropped_note = 0, ""
         self._unfit: list[str] = []  # error messages of the skipped messages
         self._waiting: Queue[_Waiting] = Queue(MAX_WAITING)
-        self._events: Queue[Event | InputError | None] = Queue(max(1, source.prefetch))
         self._newest = 0.0  # arrival of the newest frame
         self._arrived = self._lost = 0
         self._closed = Flag()
@@ -120,11 +128,9 @@ class TrackerServer(Tracker):
         self._say_waiting(0)
         # Daemon threads, so that the process can exit without `close`.
         self._thread = Thread(target=self._serve, name="server", daemon=True)
-        self._decoder = Thread(target=self._decode, name="received frames", daemon=True)
         self._thread.start()
-        self._decoder.start()
         if self._again is not None:
-            Thread(target=send_again, args=(self._again, self._listener.getsockname()), daemon=True).start()
+            Thread(target=self._send_again, args=(self._again, self._listener.getsockname()), daemon=True).start()
 
     # ---- called by the mapper, in its thread -----------------------------------------------------------------
 
@@ -153,16 +159,23 @@ class TrackerServer(Tracker):
         Raises:
             InputError: If the run's settings do not fit the received frames, or the server fails.
         """
-        while not self._ended:
-            event = self._events.get()
+        while not self._ended and not self._closed.is_set():
+            try:
+                item = self._waiting.get(timeout=GLANCE)
+            except Empty:
+                continue
             self._say_waiting(1)
-            if event is None or isinstance(event, InputError):
+            if item is None or isinstance(item, InputError):
                 self._ended = True
-                if event is not None:
-                    raise event
+                if item is not None:
+                    raise item
                 return
-            self._taken += isinstance(event, TrackedFrame)
-            yield event
+            if isinstance(item, PoseCorrection):
+                yield item
+                continue
+            frame = self._decoded(item)
+            self._taken += 1
+            yield frame
 
     def pictures(self, names: Sequence[str]) -> Iterator[tuple[str, Picture]]:
         return pictures_again(self._received.reader, ((name, self._received.undistorter) for name in names))
@@ -171,7 +184,6 @@ class TrackerServer(Tracker):
         """Stop listening, disconnect the sender and delete the temporary files."""
         self._closed.set()
         self._thread.join()
-        self._decoder.join()
         if self._spool is not None:
             self._spool.close()
 
@@ -180,6 +192,19 @@ class TrackerServer(Tracker):
         """The received frames. A HELLO must have arrived."""
         assert self._spool is not None
         return self._spool
+
+    def _decoded(self, frame: Frame) -> TrackedFrame:
+        """Read the image and the points of a frame that has its pose."""
+        spool, pose = self._received, frame.T_camera_world
+        assert pose is not None
+        try:
+            points = spool.points(frame.place)
+            pixels = spool.undistorter.points(points.pixels)
+            points = points_inside(points.xyz, pixels, points.ids, spool.undistorter, pose)
+            posed = PosedImage(spool.name(frame.number), spool.undistorter, pose, points)
+            return tracked_frame(spool.reader, self._taken, posed)
+        except Exception as error:
+            raise InputError(f"{self.address}: a stored frame cannot be read again: {error}") from None
 
     def _say_waiting(self, done: int) -> None:
         if self._progress is not None:
@@ -216,7 +241,7 @@ class TrackerServer(Tracker):
             self._listener.close()
             if self._path is not None:
                 self._path.unlink(missing_ok=True)
-            self._put(self._waiting, end)
+            self._put(end)
 
     def _talk(self, connection: Connection, lobby: Lobby) -> bool:
         """Serve one connection until it ends. Returns whether the stream has ended with it.
@@ -233,8 +258,6 @@ class TrackerServer(Tracker):
                     kind, payload = connection.receive(hello, others)
                 else:  # it was in the lobby meanwhile
                     kind, payload = Kind.HELLO, connection.hello
-                if kind is Kind.END:
-                    break
                 if kind is Kind.HELLO:
                     hello = parse_hello(payload)
                     if self._spool is not None:
@@ -243,10 +266,12 @@ class TrackerServer(Tracker):
                     if connection.hello is None:
                         connection.say(Kind.WELCOME)
                     connection.hello = payload
-                self._received.keep(kind, payload)
+                place = self._received.keep(kind, payload)
+                if kind is Kind.END:
+                    break
                 if kind is not Kind.HELLO:
                     try:
-                        self._take(kind, payload, ordering)
+                        self._take(kind, payload, place, ordering)
                     except UnfitError as error:
                         self._leave_out(error, ordering)
                     self._deliver(ordering)
@@ -268,10 +293,7 @@ class TrackerServer(Tracker):
         if problem is not None:
             self._notes.append(f"the stream ended early: {problem}; the run went on with the frames before")
         ordering.close()
-        try:
-            self._deliver(ordering)
-        except SpoolFullError as error:
-            self._notes.append(f"the last frames are missing: {error}")
+        self._deliver(ordering)
         if self._unfit:
             messages = "1 message was" if len(self._unfit) == 1 else f"{len(self._unfit)} messages were"
             self._notes.append(f"{messages} left out: {'' if len(self._unfit) == 1 else 'the last: '}{self._unfit[-1]}")
@@ -301,7 +323,7 @@ class TrackerServer(Tracker):
         self._notes = [*(other for other in self._notes if other != self._dropped_note), note]
         self._dropped_note = note
 
-    def _take(self, kind: Kind, payload: bytes, ordering: Ordering) -> None:
+    def _take(self, kind: Kind, payload: bytes, place: int, ordering: Ordering) -> None:
         """Process one FRAME, POSE or CORRECTION message.
 
         Raises ProtocolError if it is malformed or out of place, and UnfitError if it is well-formed but unusable.
@@ -309,7 +331,7 @@ class TrackerServer(Tracker):
         if kind is Kind.CORRECTION:
             ordering.add_correction(parse_correction(payload))
             return
-        frame = parse_frame(payload, kind)
+        frame = parse_frame(payload, kind, place)
         if kind is Kind.POSE:
             ordering.add_pose(frame)
             return
@@ -318,7 +340,7 @@ class TrackerServer(Tracker):
         name = spool.add(frame)
         spool.reader.require_fitting([(name, spool.undistorter)])
         ordering.add_frame(frame)
-        self._arrived, self._newest = self._arrived + 1, spool.received(name)
+        self._arrived, self._newest = self._arrived + 1, spool.arrived(name)
         if len(spool) == 1 and spool.hello.name:
             self._notes.append(f"the tracker there is {spool.hello.name}")
 
@@ -330,47 +352,25 @@ class TrackerServer(Tracker):
                 return
             if isinstance(item, Correction):
                 index = np.array([self._indices[number] for number in item.numbers.tolist()], dtype=np.int64)
-                self._put(self._waiting, PoseCorrection(index, item.T_camera_world, item.ids, item.xyz))
+                self._put(PoseCorrection(index, item.T_camera_world, item.ids, item.xyz))
             else:
-                self._put(self._waiting, self._posed(item))
+                self._indices[item.number] = len(self._indices)
+                self._put(replace(item, points=SparsePoints()))
         self._lost = ordering.lost
 
-    def _posed(self, frame: Frame) -> PosedImage:
-        """Number a frame that has its pose, and store its points. Returns it without them."""
-        spool, pose = self._received, frame.T_camera_world
-        assert pose is not None
-        pixels = spool.undistorter.points(frame.points.pixels)
-        points = points_inside(frame.points.xyz, pixels, frame.points.ids, spool.undistorter, pose)
-        name = spool.name(frame.number)
-        spool.keep_points(name, points)
-        self._indices[frame.number] = len(self._indices)
-        return PosedImage(name, spool.undistorter, pose)
-
-    def _put(self, to: Queue, event: _Waiting | Event) -> None:
+    def _put(self, item: _Waiting) -> None:
         while not self._closed.is_set():
             try:
-                to.put(event, timeout=GLANCE)
+                self._waiting.put(item, timeout=GLANCE)
             except Full:
                 continue
             return
 
-    # ---- the decoding thread -----------------------------------------------------------------------------------
-
-    def _decode(self) -> None:
-        """Decode what waits, up to `source.prefetch` frames ahead of the mapper."""
-        index = 0
-        while not self._closed.is_set():
-            try:
-                item = self._waiting.get(timeout=GLANCE)
-                if isinstance(item, PosedImage):
-                    posed = item.with_points(self._received.points(item.name))
-                    item = tracked_frame(self._received.reader, index, posed)
-                    index += 1
-                    _ = item.pyramid  # computed and cached here, in this thread, to save the mapper time
-            except Empty:
-                continue
-            except Exception as error:  # as in `_serve`: the run must not be left waiting
-                item = InputError(f"{self.address}: a stored frame cannot be read again: {error}")
-            self._put(self._events, item)
-            if item is None or isinstance(item, InputError):
-                return
+    @staticmethod
+    def _send_again(file: Path, address: tuple[str, int]) -> None:
+        """Send a stream that a killed run has kept, as far as it goes."""
+        with suppress(OSError), file.open("rb") as stream, create_connection(address) as connection:
+            connection.sendfile(stream)
+            connection.shutdown(SHUT_WR)
+            while connection.recv(1024):  # until the server has read everything
+                pass

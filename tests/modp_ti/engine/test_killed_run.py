@@ -135,7 +135,7 @@ def test_the_frames_of_another_tracker_survive_a_killed_run(recording: Path, tmp
     options = ["--to", str(tmp_path / "server"), "--late", "1", "--wait", "300", "--rate", "1"]
     sender = subprocess.Popen([*script, *options], cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     wait_for((tmp_path / "out" / "recording.yaml").exists)
-    wait_for(lambda: len(list((tmp_path / "temporary").glob("*/frames/*"))) > 12)
+    wait_for(lambda: sum(file.stat().st_size for file in (tmp_path / "temporary").glob("*/stream.modp")) > 6 * 4000)
     assert run.end(signal.SIGKILL) == -signal.SIGKILL
     sender.kill()
     sender.wait()
