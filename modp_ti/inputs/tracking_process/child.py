@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import queue
 import sys
 import threading
 from collections import deque
@@ -25,14 +24,12 @@ from modp_ti.inputs.sources import FrameReader, ImageSource, Undistorter
 from modp_ti.inputs.tracking_process.exchange import (
     CameraRevised,
     CountsBoard,
-    Delivered,
     Ended,
-    FrameRing,
     Job,
     Opened,
     Preparing,
-    RingMade,
-    SlotLayout,
+    Vignette,
+    with_vignette,
 )
 
 # Interval [s] at which the counts are published and the wish to finish is noticed.
@@ -47,33 +44,28 @@ _Message = PoseCorrection | CameraRevised | Ended
 
 
 def main() -> None:
-    """Serve the parent process, whose descriptors of pipe, ring and board are the arguments."""
+    """Serve the parent process, whose descriptors of pipe and board are the arguments."""
     left_to_parent()
     own_terminal()
     cv2.setNumThreads(1)
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # the end of a stream is told in a note
-    pipe, ring, board = (int(argument) for argument in sys.argv[1:4])
+    pipe, board = (int(argument) for argument in sys.argv[1:3])
     connection = Connection(pipe)
     try:
         job = connection.recv()
     except EOFError:
         return
     with suppress(BrokenPipeError):  # the parent is gone
-        _Child(connection, ring, CountsBoard(board), job).run()
+        _Child(connection, CountsBoard(board), job).run()
 
 
 class _Child:
     """The tracker and its threads: this one tracks, one sends, and one listens to the parent."""
 
-    def __init__(self, connection: Connection, ring: int, board: CountsBoard, job: Job) -> None:
+    def __init__(self, connection: Connection, board: CountsBoard, job: Job) -> None:
         self._connection = connection
-        self._memory = ring
         self._board = board
         self._job = job
-        self._slots = max(2, job.config.source.prefetch)
-        self._free: queue.SimpleQueue[int] = queue.SimpleQueue()
-        for slot in range(self._slots):
-            self._free.put(slot)
         self._outbox = Outbox()
         self._images: ImageSource | None = None
         self._tracker: KltTracker | None = None
@@ -125,33 +117,30 @@ class _Child:
     # ---- the sending thread ----------------------------------------------------------------------------------
 
     def _send(self, undistorter: Undistorter) -> None:
-        """Send the events in order, each frame as soon as a slot is free.
+        """Send the events in order, each frame as soon as the parent takes it.
 
         Args:
             undistorter: Undistorter of the first frame. The tracker may have a newer one already.
         """
         assert self._tracker is not None and self._images is not None
         reader = FrameReader(self._images, self._job.config.source)
-        ring: FrameRing | None = None
+        vignette = None
         while True:
             event = self._outbox.get()
             try:
-                if isinstance(event, FrameRecord | TrackedFrame):
-                    slot = self._free.get()
-                    if isinstance(event, FrameRecord):
-                        event = event.with_picture(reader.read(event.name, undistorter))
-                    if ring is None:
-                        ring = FrameRing(self._memory, SlotLayout.of(event), self._slots)
-                        self._connection.send(RingMade(ring.layout, event.vignette))
-                    ring.write(slot, event)
-                    self._connection.send(Delivered(slot, FrameRecord.of(event), event.camera, event.mask is not None))
-                else:
-                    if isinstance(event, CameraRevised):
-                        undistorter = event.intrinsics.undistorter(self._tracker.scale)
-                        ring = None  # the vignette is another one
-                    self._connection.send(event)
-                    if isinstance(event, Ended):
-                        return
+                if isinstance(event, FrameRecord):
+                    event = event.with_picture(reader.read(event.name, undistorter))
+                if isinstance(event, TrackedFrame):
+                    if event.vignette is not vignette:
+                        vignette = event.vignette
+                        self._connection.send(Vignette(vignette))
+                    _ = event.pyramid  # built here, to save the parent time
+                    event = with_vignette(event, None)
+                elif isinstance(event, CameraRevised):
+                    undistorter = event.intrinsics.undistorter(self._tracker.scale)
+                self._connection.send(event)
+                if isinstance(event, Ended):
+                    return
             except InputError as error:  # a stored image is gone
                 self._connection.send(Ended(self._tracker.notes, self._tracker.unreadable, error))
                 return
@@ -159,18 +148,16 @@ class _Child:
     # ---- the listening thread --------------------------------------------------------------------------------
 
     def _listen(self) -> None:
-        """Take back slots, publish the counts and end the recording when asked. Exit when the parent has no more use.
+        """Publish the counts, and end the recording when asked. Exit when the parent has no more use.
 
         If the parent was killed, the frames that were recorded stay.
         """
         finished = False
         try:
             while True:
-                if self._connection.poll(GLANCE):
-                    slot = self._connection.recv()
-                    if slot is None:
-                        os._exit(0)
-                    self._free.put(slot)
+                if self._connection.poll(GLANCE):  # None, or the end
+                    self._connection.recv()
+                    os._exit(0)
                 self._publish()
                 if self._board.finish and not finished and self._images is not None:
                     finished = True

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 import tempfile
@@ -28,14 +27,12 @@ from modp_ti.inputs.sources.frame_store import StoredFrames, kept_frames
 from modp_ti.inputs.tracking_process.exchange import (
     CameraRevised,
     CountsBoard,
-    Delivered,
     Ended,
-    FrameRing,
     Job,
     Opened,
     Preparing,
-    RingMade,
-    anonymous_memory,
+    Vignette,
+    with_vignette,
 )
 
 # Time [s] that the process gets to end by itself.
@@ -64,8 +61,6 @@ class TrackingProcess(Tracker):
 
     def __init__(self, config: SceneConfig, progress: Progress | None = None) -> None:
         self._config = config
-        self._slots = max(2, config.source.prefetch)
-        self._ring: FrameRing | None = None
         self._vignette: NDArray[np.float32] | None = None
         self._taken = 0  # frames
         self._unreadable: Mapping[str, UnreadableImageError] = {}
@@ -73,12 +68,10 @@ class TrackingProcess(Tracker):
         self._kept = None
         if config.source.stream is not None:
             self._kept = tempfile.TemporaryDirectory(prefix="modp-ti-live-", ignore_cleanup_errors=True)
-        self._memory, board = anonymous_memory(), anonymous_memory()
-        self._board = CountsBoard(board)
         self._connection, theirs = Pipe()
-        self._process = _started([theirs.fileno(), self._memory, board])
-        theirs.close()
-        os.close(board)
+        with tempfile.TemporaryFile() as board, theirs:
+            self._board = CountsBoard(board.fileno())
+            self._process = _started([theirs.fileno(), board.fileno()])
         self._interrupt = RecordingInterrupt(self._interrupted)
         self._progress = progress
         self._notes: list[str] = []
@@ -148,11 +141,11 @@ class TrackingProcess(Tracker):
         self._wait_until_open()
         while not self._ended:
             message = self._receive()
-            if isinstance(message, RingMade):
-                self._ring = FrameRing(self._memory, message.layout, self._slots)
+            if isinstance(message, Vignette):
                 self._vignette = message.vignette
-            elif isinstance(message, Delivered):
-                yield self._delivered(message)
+            elif isinstance(message, TrackedFrame):
+                self._taken += 1
+                yield with_vignette(message, self._vignette)
             elif isinstance(message, CameraRevised):
                 self._undistorter = message.intrinsics.undistorter(self._scale)
             elif isinstance(message, PoseCorrection):
@@ -180,9 +173,6 @@ class TrackingProcess(Tracker):
             self._process.kill()
             self._process.wait()
         self._interrupt.give_back()
-        if self._memory >= 0:
-            os.close(self._memory)
-            self._memory = -1
         if self._kept is not None:
             self._kept.cleanup()
 
@@ -201,16 +191,6 @@ class TrackingProcess(Tracker):
         except subprocess.TimeoutExpired:
             return "it closed its pipe"
         return f"signal {-code}" if code < 0 else f"exit code {code}"
-
-    def _delivered(self, message: Delivered) -> TrackedFrame:
-        assert self._ring is not None
-        frame = self._ring.read(message, self._vignette)
-        self._taken += 1
-        try:
-            self._connection.send(message.slot)
-        except OSError:
-            pass  # the process is gone: the next message says so
-        return frame
 
     def _end(self, message: Ended) -> None:
         self._ended = True
