@@ -19,9 +19,8 @@ from modp_ti.config.scene_file import load_scene
 from modp_ti.config.settings import SceneConfig
 from modp_ti.files.errors import InputError
 from modp_ti.files.terminal import CleanConsole
-from modp_ti.many.batch import LOGS, run_batch
+from modp_ti.many.batch import LOGS, Scene, for_a_task, run_batch
 from modp_ti.many.pool import LocalPool
-from modp_ti.many.scenes import Scene, for_a_task
 from modp_ti.outputs.formats.run_files import read_scores
 
 # Figures of one table row by name; None if a run does not have the figure.

@@ -77,9 +77,8 @@ def batch(
     with outcome(as_json) as result:
         # Imported here, so that `--help` does not wait for the readers to load.
         from modp_ti.files.storage import Storage
-        from modp_ti.many.batch import LOGS, PAGE, Shares, run_batch
+        from modp_ti.many.batch import LOGS, PAGE, Shares, read_scenes, run_batch, with_store
         from modp_ti.many.pool import open_pool
-        from modp_ti.many.scenes import read_scenes, with_store
 
         preset = chosen_preset(fast, best)
         if store is not None:

@@ -1,19 +1,22 @@
-"""`run_batch`: maps the scenes of a batch by the tasks of a pool, and writes their tables and the summary page."""
+"""`run_batch`: maps scenes by the tasks of a pool, and writes their tables and the summary page."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import zlib
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import monotonic
 
 from rich.console import Console
 
-from modp_ti.config.settings import WITH_SECRETS, SceneConfig
+from modp_ti.config.settings import WITH_SECRETS, SceneConfig, ViewSettings
 from modp_ti.engine.interruption import Interruption
 from modp_ti.files.errors import InputError
 from modp_ti.files.run_folder import appearing
-from modp_ti.files.urls import shown_url
+from modp_ti.files.urls import actual_url, shown_url
+from modp_ti.inputs.bare_recording import base_of, named_scene
+from modp_ti.inputs.scene_paths import refuse_output_in_input
 from modp_ti.many.pool import Ended, Pool, Resources, Running
 from modp_ti.many.results import (
     ProgressTable,
@@ -24,12 +27,98 @@ from modp_ti.many.results import (
     write_parquet,
     write_summary_page,
 )
-from modp_ti.many.scenes import Scene, fetch_finished, finished_metrics
-from modp_ti.many.task import PATIENCE, End
+from modp_ti.many.task import PATIENCE, End, fetch_finished, finished_metrics
 
 CSV, PARQUET, PAGE, LOGS = "batch.csv", "batch.parquet", "index.html", "logs"
 # Longest wait for an event [s]: how often the table is brought up to date at least.
 GLANCE = 0.5
+
+
+# Frames between snapshots where the scene does not set `snapshot_every`.
+SNAPSHOT_EVERY = 50
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A recording of a batch.
+
+    Attributes:
+        name: Unique name in the batch: that of its output folder or, if it cannot be read, of what the user named.
+        given: What the user named.
+        config: Its settings, None if they cannot be read.
+        error: Otherwise one line that says why.
+    """
+
+    name: str
+    given: Path
+    config: SceneConfig | None = None
+    error: str = ""
+
+
+def read_scenes(given: Iterable[Path], overrides: Sequence[str] = (), preset: str | None = None) -> list[Scene]:
+    """Read the settings of scene files and recordings. One that cannot be read does not hinder the others.
+
+    Args:
+        given: Scene files, videos and folders of images. One that is named twice counts once.
+        overrides: As for `load_scene`, for every scene.
+        preset: As for `load_scene`, for every scene.
+
+    Returns:
+        The scenes, in order. No two write to the same folder.
+    """
+    scenes: list[Scene] = []
+    outputs: dict[Path, Path] = {}  # what the user named, by the output folder
+    for path in {path.expanduser().resolve(): path for path in given}.values():
+        try:
+            config = _read(path, overrides, preset, list(outputs))
+            if config.output in outputs:
+                other = outputs[config.output]
+                raise InputError(f"{path}: {config.output} is the output folder of {other} too: set another one")
+        except InputError as error:
+            scenes.append(Scene(_unique(Path(shown_url(str(path))).name or str(path), scenes), path, error=str(error)))
+            continue
+        outputs[config.output] = path
+        scenes.append(Scene(_unique(config.output.name, scenes), path, config))
+    return scenes
+
+
+def _read(path: Path, overrides: Sequence[str], preset: str | None, taken: list[Path]) -> SceneConfig:
+    config = named_scene(path, overrides, preset, taken)
+    refuse_output_in_input(config, base_of(path))
+    if config.is_live:
+        raise InputError(f"{path}: a live source has no place in a batch: map it with `modp-ti run`")
+    if config.parts is not None:
+        raise InputError(f"{path}: parts are mapped by tasks of their own: map it with `modp-ti run`, or remove parts")
+    return for_a_task(config)
+
+
+def for_a_task(config: SceneConfig) -> SceneConfig:
+    """Return a scene's settings for a run in a process that may be lost, and that nobody watches."""
+    every = config.snapshot_every
+    if every is None and config.can_be_resumed:
+        every = SNAPSHOT_EVERY
+    return config.model_copy(update={"snapshot_every": every, "view": ViewSettings()})
+
+
+def _unique(name: str, others: Sequence[Scene]) -> str:
+    taken = {scene.name for scene in others}
+    choices = (name if number == 1 else f"{name}-{number}" for number in range(1, len(taken) + 2))
+    return next(choice for choice in choices if choice not in taken)
+
+
+def with_store(scenes: Iterable[Scene], url: str) -> list[Scene]:
+    """Return scenes whose snapshots are copied to folders of their own below a URL.
+
+    The folder's name ends with a checksum of the output folder, so that it does not depend on the other scenes.
+    """
+    url, stored = actual_url(url), []
+    for scene in scenes:
+        if scene.config is not None:
+            output = scene.config.output
+            own = f"{url.rstrip('/')}/{output.name}-{zlib.crc32(str(output).encode()):08x}"
+            scene = replace(scene, config=scene.config.model_copy(update={"snapshot_store": own}))
+        stored.append(scene)
+    return stored
 
 
 @dataclass(frozen=True)
@@ -102,12 +191,9 @@ class _Batch:
         self._results = {scene.name: _before(scene) for scene in scenes}
         self._submitted: dict[str, Resources] = {}  # of the scenes that have not ended
         self._table = ProgressTable(console, lambda: list(self._results.values()))
-        self._unwritten = ""
 
     def run(self) -> list[SceneResult]:
         self._write()
-        if self._unwritten:
-            raise InputError(self._unwritten)
         with self._table, Interruption(lambda: None) as stop:
             stop.begin()
             for result in self._results.values():
@@ -120,34 +206,20 @@ class _Batch:
                 if self._submitted:
                     self._stop()
             finally:
-                self._write()
+                self._write_later()
         return list(self._results.values())
 
     def _submit_all(self) -> None:
-        """Submit the scenes that wait. One whose finished files are in its storage is fetched instead."""
-        wanted = {}
-        for name, config in self._configs.items():
-            if self._results[name].state is State.waiting and not self._fetched(name, config):
-                wanted[name] = config
+        wanted = [name for name, result in self._results.items() if result.state is State.waiting]
         machines = self._pool.machines
-        for name, config in wanted.items():
-            self._submitted[name] = self._shares.of(config, machines, len(wanted))
+        for name in wanted:
+            self._submitted[name] = self._shares.of(self._configs[name], machines, len(wanted))
             self._submit(name)
 
     def _submit(self, name: str) -> None:
         resources = self._submitted[name]
         settings = with_resources(self._configs[name], resources).model_dump(mode="json", context=WITH_SECRETS)
         self._pool.submit(name, settings, resources)
-
-    def _fetched(self, name: str, config: SceneConfig) -> bool:
-        try:
-            if not fetch_finished(config):
-                return False
-        except InputError as error:
-            self._table.note(f"{name}: {error}")
-            return False
-        self._end(name, State.before)
-        return True
 
     def _stop(self) -> None:
         """Have the scenes that run save what they have, and raise KeyboardInterrupt."""
@@ -202,24 +274,25 @@ class _Batch:
         metrics = finished_metrics(self._configs[name]) if state.is_done else None
         self._change(name, state=state, error=error, figures={} if metrics is None else figures(metrics))
         self._table.ended(self._results[name])
-        self._write()
+        self._write_later()
 
     def _change(self, name: str, **changes: object) -> None:
         self._results[name] = replace(self._results[name], **changes)
 
     def _write(self) -> None:
-        """Write tables and page. Once the batch runs, a disk that is full only delays them."""
-        results, before = list(self._results.values()), self._unwritten
+        """Write tables and page."""
+        results = list(self._results.values())
+        with appearing(self._folder) as staged:
+            write_csv(staged / CSV, results)
+            write_parquet(staged / PARQUET, results)
+            write_summary_page(staged / PAGE, results, self._folder)
+
+    def _write_later(self) -> None:
+        """Write tables and page. A disk that is full only delays them."""
         try:
-            with appearing(self._folder) as staged:
-                write_csv(staged / CSV, results)
-                write_parquet(staged / PARQUET, results)
-                write_summary_page(staged / PAGE, results, self._folder)
-            self._unwritten = ""
+            self._write()
         except InputError as error:
-            self._unwritten = str(error)
-            if self._unwritten != before:
-                self._table.note(self._unwritten)
+            self._table.note(str(error))
 
 
 def _before(scene: Scene) -> SceneResult:
@@ -228,5 +301,9 @@ def _before(scene: Scene) -> SceneResult:
     if scene.config is None:
         return SceneResult(scene.name, given, None, State.failed, error=scene.error)
     result = SceneResult(scene.name, given, str(scene.config.output), State.waiting)
+    try:
+        fetch_finished(scene.config)  # from its storage
+    except InputError:
+        pass  # it is mapped again
     metrics = finished_metrics(scene.config)
     return result if metrics is None else replace(result, state=State.before, figures=figures(metrics))

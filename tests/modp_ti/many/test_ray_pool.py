@@ -12,10 +12,9 @@ from typing import Any
 import pytest
 
 from modp_ti.files.errors import InputError
-from modp_ti.many.batch import run_batch
+from modp_ti.many.batch import read_scenes, run_batch
 from modp_ti.many.pool import Ended, Running, open_pool
 from modp_ti.many.results import State
-from modp_ti.many.scenes import read_scenes
 from tests.modp_ti.many.machines import made_cluster, other_machine
 
 pytest.importorskip("ray", reason="Ray is not installed: pip install 'modp-ti[cluster]'")

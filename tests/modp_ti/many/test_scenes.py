@@ -1,4 +1,4 @@
-"""The scenes of a batch: read one by one, each with an output folder and a storage of its own."""
+"""The scenes of a batch: each with an output folder and a storage; and what counts as a finished run of one."""
 
 from __future__ import annotations
 
@@ -6,9 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from modp_ti.many.batch import with_resources
+from modp_ti.config.scene_file import dump_scene, load_scene
+from modp_ti.config.settings import SceneConfig
+from modp_ti.many.batch import SNAPSHOT_EVERY, read_scenes, with_resources, with_store
 from modp_ti.many.pool import Resources
-from modp_ti.many.scenes import SNAPSHOT_EVERY, read_scenes, with_store
+from modp_ti.many.task import finished_metrics
 
 SCENE = "source: {path: images}\ntracker: {kind: colmap}\noutput: OUT\n"
 
@@ -26,25 +28,20 @@ def scene(file: Path, output: str, more: str = "") -> Path:
 
 
 def test_what_cannot_be_read_does_not_hinder_the_others(folder: Path) -> None:
-    scene(folder / "good.yaml", "maps/good")
-    scene(folder / "bad.yaml", "maps/bad", "nonsense: 1\n")
-    scene(folder / "live.yaml", "maps/live").write_text("source: {stream: 0}\ntracker: {kind: klt}\noutput: live\n")
-    scenes = read_scenes([folder / name for name in ("good.yaml", "gone.yaml", "bad.yaml", "live.yaml")])
+    good, bad = scene(folder / "good.yaml", "maps/good"), scene(folder / "bad.yaml", "maps/bad", "nonsense: 1\n")
+    (folder / "live.yaml").write_text("source: {stream: 0}\ntracker: {kind: klt}\noutput: live\n")
+    scenes = read_scenes([good, folder / "gone.yaml", bad, folder / "live.yaml", good, folder / "." / "good.yaml"])
     assert [scene.name for scene in scenes] == ["good", "gone.yaml", "bad.yaml", "live.yaml"]
     assert [scene.config is not None for scene in scenes] == [True, False, False, False]
-    assert ["" if scene.error == "" else scene.error.split(": ", 1)[1] for scene in scenes[:2]] == [
-        "",
-        "no such scene file",
-    ]
-    assert "unknown key `nonsense`" in scenes[2].error
-    assert "a live source has no place in a batch" in scenes[3].error
+    assert all(scene.error and "\n" not in scene.error for scene in scenes[1:])
 
 
-def test_no_two_scenes_write_to_one_folder(folder: Path) -> None:
+def test_no_two_scenes_have_a_name_or_a_folder_in_common(folder: Path) -> None:
+    files = [scene(folder / name / "scene.yaml", "out") for name in ("a", "b", "c")]
+    assert [scene.name for scene in read_scenes(files)] == ["out", "out-2", "out-3"]
     first, second = scene(folder / "a.yaml", "maps/x"), scene(folder / "b.yaml", "maps/x")
-    scenes = read_scenes([first, second, first, folder / "." / "a.yaml"])
-    assert [scene.given for scene in scenes] == [first, second], "one that is named twice counts once"
-    assert "is the output folder of" in scenes[1].error and str(first) in scenes[1].error
+    scenes = read_scenes([first, second])
+    assert scenes[1].config is None and str(first) in scenes[1].error
 
 
 def test_recordings_of_one_name_get_folders_of_their_own_and_keep_them(folder: Path) -> None:
@@ -65,34 +62,35 @@ def test_recordings_of_one_name_get_folders_of_their_own_and_keep_them(folder: P
     assert outputs() == expected
 
 
-def test_names_are_unique_where_output_folders_have_the_same_name(folder: Path) -> None:
-    files = [scene(folder / name / "scene.yaml", "out") for name in ("a", "b", "c")]
-    assert [scene.name for scene in read_scenes(files)] == ["out", "out-2", "out-3"]
+@pytest.mark.parametrize(
+    ("more", "every"),
+    [
+        ("", SNAPSHOT_EVERY),
+        ("snapshot_every: 7\n", 7),
+        ("mode: offline\n", None),
+        ("snapshot_every: 0\n", 0),
+        ("view: true\n", SNAPSHOT_EVERY),
+    ],
+)
+def test_scenes_are_saved_on_the_way_where_they_can_be_resumed(folder: Path, more: str, every: int | None) -> None:
+    (read,) = read_scenes([scene(folder / "a.yaml", "a", more)])
+    config = read.config
+    assert config is not None and config.snapshot_every == every and not config.view.enabled
 
 
-def test_scenes_are_saved_on_the_way_where_they_can_be_resumed(folder: Path) -> None:
-    files = [
-        scene(folder / "a.yaml", "a"),
-        scene(folder / "b.yaml", "b", "snapshot_every: 7\n"),
-        scene(folder / "c.yaml", "c", "mode: offline\n"),
-        scene(folder / "d.yaml", "d", "snapshot_every: 0\n"),
-        scene(folder / "e.yaml", "e", "view: true\n"),
-    ]
-    configs = [scene.config for scene in read_scenes(files)]
-    assert [config and config.snapshot_every for config in configs] == [SNAPSHOT_EVERY, 7, None, 0, SNAPSHOT_EVERY]
-    assert not any(config and config.view.enabled for config in configs)
-
-
-def test_a_process_has_the_threads_and_the_device_that_were_asked_for(folder: Path) -> None:
-    (plain, own) = read_scenes([scene(folder / "a.yaml", "a"), scene(folder / "b.yaml", "b", "threads: 2\n")])
-    assert plain.config is not None and own.config is not None
-    for config, resources, expected in (
-        (plain.config, Resources(3.0), (3, "cpu")),
-        (plain.config, Resources(0.5, 0.5), (1, "auto")),
-        (own.config, Resources(3.0, 1.0), (2, "auto")),
-    ):
-        given = with_resources(config, resources)
-        assert (given.threads, given.device) == expected
+@pytest.mark.parametrize(
+    ("more", "resources", "expected"),
+    [
+        ("", Resources(3.0), (3, "cpu")),
+        ("", Resources(0.5, 0.5), (1, "auto")),
+        ("threads: 2\n", Resources(3.0, 1.0), (2, "auto")),
+    ],
+)
+def test_a_process_has_the_threads_and_the_device_that_were_asked_for(
+    folder: Path, more: str, resources: Resources, expected: tuple[int, str]
+) -> None:
+    given = with_resources(load_scene(scene(folder / "a.yaml", "a", more)), resources)
+    assert (given.threads, given.device) == expected
 
 
 def test_the_storage_of_a_scene_does_not_depend_on_the_others(folder: Path) -> None:
@@ -105,3 +103,41 @@ def test_the_storage_of_a_scene_does_not_depend_on_the_others(folder: Path) -> N
     both = stores(*files)
     assert both == [*stores(files[0]), *stores(files[1])] == stores(*reversed(files))[::-1]
     assert both[0] != both[1] and all(url.startswith("s3://bucket/maps/out-") for url in both)
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> SceneConfig:
+    """Settings whose output folder holds a finished run of them, at the scale that `auto` became."""
+    (tmp_path / "scene.yaml").write_text("source: {path: images}\ntracker: {kind: klt, maps: all}\noutput: out\n")
+    config = load_scene(tmp_path / "scene.yaml")
+    (tmp_path / "out").mkdir()
+    dump_scene(config.resolved(0.75), tmp_path / "out" / "config.yaml")
+    (tmp_path / "out" / "metrics.json").write_text('{"frames": 9}')
+    return config
+
+
+def test_a_run_with_the_same_settings_is_finished(config: SceneConfig) -> None:
+    assert finished_metrics(config) == {"frames": 9} == finished_metrics(config.resolved(0.75))
+    assert finished_metrics(config.model_copy(update={"threads": 3, "snapshot_every": 7, "device": "cpu"})) is not None
+    assert finished_metrics(config.model_copy(update={"seed": 4})) is None
+    assert finished_metrics(config.resolved(0.5)) is None
+
+
+def test_a_run_whose_further_maps_are_not_finished_is_not(config: SceneConfig) -> None:
+    (config.output / "metrics.json").write_text('{"frames": 9, "further_maps": 2}')
+    for place in (2, 3):
+        assert finished_metrics(config) is None
+        (config.output / f"map-{place}").mkdir()
+        (config.output / f"map-{place}" / "metrics.json").write_text("{}")
+    assert finished_metrics(config) is not None
+
+
+@pytest.mark.parametrize("name", ["metrics.json", "config.yaml"])
+@pytest.mark.parametrize("content", [None, "", "{", "[1]", "\0"])
+def test_files_that_are_missing_or_damaged_are_no_finished_run(
+    config: SceneConfig, name: str, content: str | None
+) -> None:
+    (config.output / name).unlink()
+    if content is not None:
+        (config.output / name).write_text(content)
+    assert finished_metrics(config) is None
