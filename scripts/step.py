@@ -17,7 +17,7 @@ from fields.map.gaussians import GaussianField
 from fields.map.keyframes import KeyframeStore
 from fields.runtime.backend import initialise
 from fields.runtime.engine import ti
-from modp_ti.engine.run_clock import peak_memory_mb
+from modp_ti.engine.results import peak_memory_mb
 from pipelines.optimise.adam import LearningRates
 from pipelines.optimise.map_optimiser import MapOptimiser
 from pipelines.render.renderer import Renderer

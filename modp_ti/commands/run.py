@@ -148,7 +148,7 @@ def _run(
 
     snapshot = None
     if resume is not None:
-        from modp_ti.engine.snapshots import load_resumed
+        from modp_ti.engine.resume import load_resumed
 
         if scene is not None and is_recording(scene):
             raise InputError(f"{scene}: --resume has the recording already; leave it out")
@@ -167,8 +167,8 @@ def _run(
         return map_in_parts(config, *(tasks or (Where.local, None)), progress_console(quiet))
     if tasks is not None:
         raise InputError("--engine and --address are for --parts, whose tasks they carry out")
+    from modp_ti.engine.resume import discard
     from modp_ti.engine.session import run_scene
-    from modp_ti.engine.snapshots import discard
 
     folder = run_scene(config, progress_console(quiet), snapshot)
     if resume is not None:

@@ -86,9 +86,9 @@ def compile_size(config: SceneConfig, size: tuple[int, int] | None) -> tuple[str
     """
     from fields.geometry.camera import PinholeCamera
     from fields.runtime.backend import initialise
-    from modp_ti.engine.build import EXPECTED, build_mapper
-    from modp_ti.engine.conductor import first_frame
-    from modp_ti.engine.prefetch import FramesAhead
+    from modp_ti.engine.mapper import build_mapper
+    from modp_ti.engine.stages import EXPECTED
+    from modp_ti.engine.stream import FramesAhead
     from modp_ti.inputs.opening import open_tracker
 
     try:
@@ -101,7 +101,7 @@ def compile_size(config: SceneConfig, size: tuple[int, int] | None) -> tuple[str
         raise InputError("no frame is there before a tracker sends one: give the size, --size 640x480")
     elif size is None:
         with closing(open_tracker(config.without_clock())) as tracker:
-            camera = first_frame(FramesAhead(tracker, 0)).camera
+            camera = FramesAhead(tracker, 0).first_frame().camera
     else:
         width, height = size
         camera = PinholeCamera(float(width), float(width), width / 2, height / 2, width, height)

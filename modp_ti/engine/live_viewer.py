@@ -15,7 +15,7 @@ from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from modp_ti.config.settings import ViewSettings
 from modp_ti.engine.mapper import Mapper
-from modp_ti.engine.observer import Observer
+from modp_ti.engine.stream import Observer
 from modp_ti.outputs.progress import LiveStatus
 from modp_ti.outputs.viewer.handover import BrowserCamera, CostLimit, Gate, Latest, ThreadClock
 from modp_ti.outputs.viewer.modes import SPLATS, Photograph, painter, splats_of

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import operator
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -16,15 +15,15 @@ from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from fields.runtime.tenancy import Tenant, in_engine
+from modp_ti.config.settings import SceneConfig
 from modp_ti.files.errors import InputError
-from modp_ti.files.run_folder import appearing
+from modp_ti.files.run_folder import PRIVATE, appearing
 from modp_ti.inputs.delivered_frames import DeliveredFrames
 from modp_ti.outputs.evaluation import MapVersion
 from modp_ti.outputs.formats.dataset import image_names
 from modp_ti.outputs.formats.run_files import NOT_ALWAYS, write_map
 from modp_ti.outputs.formats.splats_ply import write_splats
 from pipelines.companions.block_files import BlockError
-from pipelines.companions.changes import ChangeSweep, EarlierVisit
 from pipelines.companions.pace import Pace
 from pipelines.offline import OfflineMapper
 from pipelines.online import OnlineMapper
@@ -32,15 +31,10 @@ from pipelines.pipeline import FrameReport, NothingToMapError, Pipeline
 from pipelines.refinement import Schedule, refine
 from pipelines.render.renderer import RenderedView
 from pipelines.settings import MappingSettings, OfflineSettings, RefineSettings
-from pipelines.state import MapState, restore_state, save_state
-from pipelines.whole.finished_map import FinishedMap, go_on
-from pipelines.whole.merge import MappedPart, merge
+from pipelines.state import MapState, restore_state
 
 
-@in_engine(
-    "add", "take", "optimise_further", "correct", "finish", "refine", "restore", "go_on_with", "watch_changes", "merge"
-)
-@in_engine("state", "trajectory", "render", "version", "save")
+@in_engine("add", "take", "correct", "finish", "refine", "restore", "trajectory", "render", "version", "save")
 class Mapper(Tenant):
     """Maps frames of up to `width` x `height` pixels as they arrive.
 
@@ -131,14 +125,6 @@ class Mapper(Tenant):
         images = self.pipeline.renderer.images
         return width <= images.max_width and height <= images.max_height
 
-    def optimise_further(self) -> bool:
-        """Make one optimisation step on the whole map, for time in which no frame waits.
-
-        Returns:
-            Whether there was something to optimise. False for an offline map.
-        """
-        return isinstance(self.pipeline, OnlineMapper) and self.pipeline.optimise_further() is not None
-
     def correct(self, correction: PoseCorrection, more: bool = False) -> None:
         """Apply poses and points that the tracker has revised, for example after a loop closure.
 
@@ -199,25 +185,17 @@ class Mapper(Tenant):
         """
         if operator.index(steps) < 0:
             raise ValueError(f"a refinement has 0 steps or more, not {steps}")
-        pipeline = self._online("is not refined: give its settings more steps")
+        pipeline = self.online
         self.finish()
         settings = RefineSettings() if settings is None else settings
         settings = settings.model_copy(update={"steps": steps, "seconds": None})
         refine(pipeline, settings, progress, done, schedule)
 
-    def state(self) -> MapState:
-        """Return everything that the next frame or step depends on, for `restore`, see `pipelines.state`.
-
-        Raises:
-            ValueError: If the map is an offline one.
-        """
-        return save_state(self._online("has no state between two frames"))
-
     def restore(self, state: MapState, frames: DeliveredFrames, again: Iterable[TrackedFrame], finished: bool) -> None:
         """Restore the state of another mapper with the same settings.
 
         Args:
-            state: The other mapper's `state()`.
+            state: The state of the other mapper's `online`, see `pipelines.state`.
             frames: The other mapper's `frames`, with the trajectory of this mapper's pipeline.
             again: The frames that it processed, without the held-out ones.
             finished: The other mapper's `finished`.
@@ -225,7 +203,7 @@ class Mapper(Tenant):
         Raises:
             KeyError, TypeError, ValueError: If the state does not fit this mapper.
         """
-        pipeline = self._online("cannot be resumed")
+        pipeline = self.online
         self.frames.origin = frames.origin
         restore_state(pipeline, state, map(self._near, again))
         if list(self.pipeline.trajectory) != frames.index:
@@ -234,43 +212,27 @@ class Mapper(Tenant):
         self.pipeline.count_beside(frames.points.nbytes)
         self.finished = finished
 
-    def go_on_with(self, finished: FinishedMap) -> None:
-        """Continue with a finished map in this new mapper. More frames may follow.
+    def noted(self, frames: Iterable[TrackedFrame]) -> Iterator[TrackedFrame]:
+        """Yield frames near the map's origin and keep their metadata, for what puts finished maps into `online`.
 
-        Raises:
-            ValueError: If the map does not fit the settings of this mapper, or this mapper is for offline maps.
+        Args:
+            frames: All frames of the finished maps, in order. More may follow once they have been iterated over.
         """
-        pipeline = self._online("cannot go on with a finished one")
-        go_on(pipeline, replace(finished, frames=self._noted(finished.frames)))
-        self.finished = True
-
-    def watch_changes(self, earlier: EarlierVisit) -> None:
-        """Mask from now on, in the keyframes of an earlier visit, what has changed since."""
-        map_ = self._online("cannot go on with a finished one")
-        changes = ChangeSweep(earlier, map_.gaussians, map_.keyframes, map_.renderer, map_.paging)
-        map_.companions.append(changes)
-
-    def merge(self, parts: Sequence[MappedPart], frames: Iterable[TrackedFrame]) -> list[int]:
-        """Put the maps of the parts of a recording into this new mapper, see `pipelines.whole.merge`.
-
-        Raises:
-            ValueError: If the maps do not fit the settings of this mapper, or this mapper is for offline maps.
-        """
-        kept = merge(self._online("is not made of parts"), parts, self._noted(frames))
-        self.finished = True
-        return kept
-
-    def _online(self, refused: str) -> OnlineMapper:
-        """The online mapper; ValueError if this one is for offline maps, which `refused` completes."""
-        if not isinstance(self.pipeline, OnlineMapper):
-            raise ValueError(f"an offline map {refused}")
-        return self.pipeline
-
-    def _noted(self, frames: Iterable[TrackedFrame]) -> Iterator[TrackedFrame]:
-        """Yield the frames near the map's origin, and keep their metadata."""
         for frame in map(self._near, frames):
             yield frame
             self._note(frame)
+        self.finished = True
+
+    @property
+    def online(self) -> OnlineMapper:
+        """The pipeline of an online map.
+
+        Raises:
+            ValueError: If the map is an offline one, which is neither refined nor continued.
+        """
+        if not isinstance(self.pipeline, OnlineMapper):
+            raise ValueError("an offline map is neither refined nor continued: give its settings more steps")
+        return self.pipeline
 
     def _near(self, frame: TrackedFrame) -> TrackedFrame:
         """Return a frame in coordinates from the map's origin, which the first one decides."""
@@ -355,3 +317,21 @@ class Mapper(Tenant):
             names = image_names(self.frames.name, written=False)
             write_map(folder, self.version(), self.frames, names, self.pipeline.keyframes, self.pipeline.near)
         return path
+
+
+def build_mapper(config: SceneConfig, camera: PinholeCamera, pace: Pace | None = None) -> Mapper:
+    """Create the mapper for the scene's mode and for images of this camera.
+
+    Args:
+        config: The scene's settings.
+        camera: The camera.
+        pace: Pace of the online loop, None for all the work of the settings.
+
+    Raises:
+        InputError: If the settings do not fit the images.
+    """
+    settings = config.offline if config.mode == "offline" else config.mapping
+    try:
+        return Mapper(camera.width, camera.height, settings, config.seed, pace, config.output / PRIVATE)
+    except ValueError as error:
+        raise InputError(str(error)) from None

@@ -1,10 +1,14 @@
-"""`RealtimeRun`: the clock of a realtime run, between the arriving frames, the pace and the mapper."""
+"""`RealtimeRun`: the clock of a realtime run, between the arriving frames, the pace and the mapper.
+
+`open_conductor` chooses between it, the repetition of a recorded session, and a run that knows no clock.
+"""
 
 from __future__ import annotations
 
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -13,20 +17,47 @@ import numpy as np
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
 from modp_ti.config.settings import SceneConfig
-from modp_ti.engine.conductor import Conductor
 from modp_ti.engine.interruption import Interruption
 from modp_ti.engine.mapper import Mapper
-from modp_ti.engine.prefetch import FramesAhead
-from modp_ti.engine.recording import FILE, SessionRecorder
+from modp_ti.engine.recording import FILE, RecordedSession, ReplayedRun, SessionRecorder
+from modp_ti.engine.stream import Conductor, FramesAhead
+from modp_ti.files.errors import InputError
 from modp_ti.inputs.protocol import Event, LiveCounts, Tracker
+from modp_ti.inputs.replay import ALL_HELD_OUT
 from modp_ti.outputs.progress import LiveStatus
-from pipelines.companions.pace import RealtimePace
+from pipelines.companions.pace import CompletePace, RealtimePace
 from pipelines.pipeline import FrameReport
 from pipelines.refinement import Schedule
 from pipelines.settings import MappingSettings, RefineSettings
 
 # Time over which the shown rates are taken [s], and number of keyframes over which the shown steps are.
 RECENT, KEYFRAMES = 5.0, 10
+
+
+def open_conductor(config: SceneConfig, tracker: Tracker, held: ExitStack) -> Conductor:
+    """Return the conductor of a run: one that repeats a recorded session, follows the clock, or knows no clock.
+
+    Args:
+        config: The scene's settings.
+        tracker: The tracker, or a recorded session.
+        held: Closes the recording when the run ends.
+
+    Raises:
+        InputError: If the session cannot be recorded, or all frames are held out.
+    """
+    if isinstance(tracker, RecordedSession):
+        return ReplayedRun(config.mapping, tracker)
+    if not config.is_realtime:
+        frames, every, views = tracker.frame_count, config.source.holdout, config.source.panorama.count
+        held_out = 0 if frames is None or every is None else -(-frames // (every * views)) * views
+        if frames and frames == held_out:
+            raise InputError(ALL_HELD_OUT)
+        return Conductor(CompletePace(config.mapping, None if frames is None else frames - held_out))
+    recorder = None
+    if config.export.session:
+        recorder = SessionRecorder()
+        held.callback(recorder.close)
+    return RealtimeRun(config.mapping, tracker, recorder)
 
 
 class RealtimeRun(Conductor):
@@ -55,8 +86,7 @@ class RealtimeRun(Conductor):
         recorder: SessionRecorder | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._realtime = RealtimePace(settings)
-        super().__init__(self._realtime)
+        self.pace: RealtimePace = RealtimePace(settings)
         self.lag: list[float] = []
         self.waiting: list[int] = []
         self.steps: list[int] = []
@@ -69,10 +99,6 @@ class RealtimeRun(Conductor):
         self._arrived: list[float] = []  # arrival of each frame
         self._saved: float | None = None
         self._recent: deque[tuple[float, int, int]] = deque()  # newest arrival, frames arrived, frames tracked
-
-    @property
-    def pace(self) -> RealtimePace:
-        return self._realtime
 
     def events(
         self, ahead: FramesAhead[Event], mapper: Mapper, stop: Interruption, further: Callable[[], None]
@@ -109,7 +135,7 @@ class RealtimeRun(Conductor):
     def _step_further(self, mapper: Mapper) -> bool:
         """Optimise the map by a step; return whether there was something to optimise."""
         began = self._clock()
-        if not mapper.optimise_further():
+        if mapper.online.optimise_further() is None:
             return False
         self.further += 1
         if self._recorder is not None:
@@ -159,10 +185,6 @@ class RealtimeRun(Conductor):
             about = {"settings": config.model_dump(mode="json"), "lag": self.lag, "costs": costs}
             self._recorder.write(folder / FILE, self.pace.decisions, about)
 
-    @property
-    def notes(self) -> list[str]:
-        return [] if self._recorder is None or self._recorder.problem is None else [self._recorder.problem]
-
     def status(self) -> LiveStatus:
         """Return the recent figures."""
         counts = self._counts()
@@ -181,8 +203,9 @@ class RealtimeRun(Conductor):
             float(np.mean(steps)) if steps else 0.0,
         )
 
-    def saved(self) -> None:
+    def saved(self) -> list[str]:
         self._saved = self._clock()
+        return [] if self._recorder is None or self._recorder.problem is None else [self._recorder.problem]
 
     def note(self) -> dict[str, Any]:
         return {"lag": self.lag[-1], "waiting": self.waiting[-1]}

@@ -20,10 +20,9 @@ from numpy.typing import NDArray
 from fields.frames.pose_correction import CameraRevision, PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.camera import PinholeCamera
-from modp_ti.engine.conductor import Conductor
 from modp_ti.engine.interruption import Interruption
 from modp_ti.engine.mapper import Mapper
-from modp_ti.engine.prefetch import FramesAhead
+from modp_ti.engine.stream import Conductor, FramesAhead
 from modp_ti.files.errors import InputError
 from modp_ti.files.reading import reading
 from modp_ti.inputs.frame_record import FrameRecord
@@ -271,7 +270,7 @@ class ReplayedRun(Conductor):
         def step() -> None:
             for _ in range(next(counts)):
                 stop.check()
-                mapper.optimise_further()
+                mapper.online.optimise_further()
                 further()
 
         step()

@@ -15,15 +15,16 @@ from fields.frames.tracked_frame import TrackedFrame
 from fields.map.trajectory import Trajectory
 from fields.runtime.backend import describe, initialise
 from modp_ti.config.settings import SceneConfig
-from modp_ti.engine.build import build_mapper
+from modp_ti.engine.mapper import build_mapper
 from modp_ti.engine.results import Results, summary_of
-from modp_ti.engine.snapshots import FILE
+from modp_ti.engine.second_visit import finished_map
+from modp_ti.engine.snapshot import FILE
 from modp_ti.files import read_json
 from modp_ti.files.errors import InputError
 from modp_ti.files.run_folder import require_usable, sole_use
 from modp_ti.inputs.delivered_frames import DeliveredFrames
 from modp_ti.outputs.evaluation import FrameScore, MapVersion, evaluate
-from modp_ti.outputs.formats.run_files import read_exposures, read_masks, read_scores, write_exposures
+from modp_ti.outputs.formats.run_files import read_scores, write_exposures
 from modp_ti.outputs.formats.splats_ply import check_splats, write_splats
 from modp_ti.outputs.lpips import open_lpips
 from modp_ti.outputs.playback.finished_run import FinishedRun, open_run
@@ -32,7 +33,7 @@ from modp_ti.outputs.progress import ProgressLine
 from modp_ti.outputs.report.record import RunRecord
 from pipelines.online import OnlineMapper
 from pipelines.refinement import refine
-from pipelines.whole.finished_map import FinishedMap, go_on
+from pipelines.whole.finished_map import go_on
 
 # Steps of a refinement, if the run's settings ask for none.
 STEPS = 1000
@@ -139,19 +140,10 @@ def _refined(run: FinishedRun, config: SceneConfig, metrics: dict[str, Any], lin
 
 def _mapper_of(run: FinishedRun, config: SceneConfig, line: ProgressLine) -> OnlineMapper:
     """Return a mapper with the map of the run."""
-    mapper = build_mapper(config, run.cameras[0].resized(*run.size)).pipeline
-    assert isinstance(mapper, OnlineMapper), "`refine` refuses other maps"
+    mapper = build_mapper(config, run.cameras[0].resized(*run.size)).online
     frames = line.through("reading the frames", frames_of(run, run.mapped, line.prepare), len(run.mapped))
-    finished = FinishedMap(
-        run.gaussians,
-        frames,
-        set(run.record.keyframes),
-        read_exposures(run.folder / "exposure.json"),
-        run.record.scene_depth,
-        masks=read_masks(run.folder / "masks"),
-    )
     try:
-        go_on(mapper, finished)
+        go_on(mapper, finished_map(run, frames))
     except ValueError as error:
         raise InputError(f"{run.folder}: its map cannot be refined: {error}") from None
     return mapper

@@ -1,10 +1,12 @@
-"""The output folder of a run. Files are written to a temporary folder and moved into place together."""
+"""The output folder of a run, whose files move into place together, and its figures: time, memory, scores, remarks."""
 
 from __future__ import annotations
 
 import json
 import shutil
+import sys
 import tempfile
+import time
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -28,6 +30,9 @@ from modp_ti.outputs.formats.run_files import NOT_ALWAYS, write_map, write_score
 from modp_ti.outputs.formats.splats_ply import check_splats
 from modp_ti.outputs.report.page import Album, ReportedRun, write_report
 from modp_ti.outputs.report.record import RunRecord
+from pipelines.companions.pace import CompletePace
+from pipelines.online import OnlineMapper
+from pipelines.pipeline import Pipeline
 
 STAGES = ("compile", "read", "track", "select", "depth", "occupancy", "optimise", "refine", "evaluate")
 # Map versions with a key in metrics.json; the value is null if the run did not make that version.
@@ -188,3 +193,67 @@ def summary_of(scores: list[FrameScore], stage: str, version: MapVersion) -> dic
         "gaussians": len(version.gaussians["position"]),
         "view_renders": version.view_renders,
     }
+
+
+def remarks(pipeline: Pipeline) -> list[str]:
+    """Return one-line remarks about a map after its last frame: what was left out, and what a budget took away."""
+    said = []
+    refused = [f"{count} {why}" for why, count in pipeline.refused.items() if count]
+    if refused:
+        said.append(f"frames that did not touch the map (mapping.gate): {', '.join(refused)}")
+    if not isinstance(pipeline, OnlineMapper):
+        return said
+    if pipeline.paging.problem is not None:
+        said.append(f"{pipeline.paging.problem}; what had no room was left out")
+    if isinstance(pipeline.pace, CompletePace):
+        optimise, plan = pipeline.settings.optimise, pipeline.pace.plan(0, *pipeline.counts)
+        if plan.steps < optimise.steps:
+            said.append(
+                f"the recording is long: its keyframes got about {plan.steps} instead of {optimise.steps} steps each "
+                "(mapping.optimise.budget; --best has no limit)"
+            )
+    return said
+
+
+class RunClock:
+    """Measures the time of the whole run (`total`) and of its mapping (`mapping`) [s], including earlier processes."""
+
+    def __init__(self, clock=time.perf_counter) -> None:
+        self._clock = clock
+        self._began = clock()
+        self._mapping_since: float | None = None
+        self._before = self._mapped = 0.0
+
+    @property
+    def total(self) -> float:
+        return self._before + self._clock() - self._began
+
+    @property
+    def mapping(self) -> float:
+        now = self._clock()
+        return self._mapped + (0.0 if self._mapping_since is None else now - self._mapping_since)
+
+    def resume(self, total: float, mapping: float) -> None:
+        """Set the time that the run took until its snapshot. Later time is not counted, as its work was lost."""
+        self._before, self._mapped = total, mapping
+
+    def begin_mapping(self) -> None:
+        self._mapping_since = self._clock()
+
+    def end_mapping(self, waited: float = 0.0) -> None:
+        """Stop the mapping clock after the last frame.
+
+        Args:
+            waited: Time for which a person paused the mapping [s]. It is subtracted.
+        """
+        self._mapped, self._mapping_since = self.mapping - waited, None
+
+
+def peak_memory_mb() -> float | None:
+    """Return the peak memory of this process so far [10^6 bytes]; None on Windows."""
+    try:
+        import resource
+    except ImportError:
+        return None
+    unit = 1 if sys.platform == "darwin" else 1024  # macOS counts bytes, Linux kibibytes
+    return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6, 1)

@@ -1,8 +1,8 @@
-"""A second visit: a new recording is located in a finished map, joined to it, and mapped on."""
+"""`EarlierMap`: the map that a run starts with, and `SecondVisit`, a finished one in which the recording is located."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -12,12 +12,11 @@ from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
 from fields.runtime.backend import initialise
 from modp_ti.config.settings import SceneConfig
-from modp_ti.engine.earlier_map import EarlierMap
 from modp_ti.engine.mapper import Mapper
-from modp_ti.engine.snapshots.snapshot import StreamDigest
+from modp_ti.engine.snapshot import StreamDigest
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.joined_tracker import JoinedTracker, Placement, prefix_for, shift_after
-from modp_ti.inputs.protocol import Tracker
+from modp_ti.inputs.protocol import Event, Tracker
 from modp_ti.outputs.formats.run_files import read_exposures, read_masks
 from modp_ti.outputs.locating.locator import Locator
 from modp_ti.outputs.locating.world_alignment import (
@@ -28,11 +27,12 @@ from modp_ti.outputs.locating.world_alignment import (
     image_motion,
     world_alignment,
 )
-from modp_ti.outputs.playback.finished_run import open_run
+from modp_ti.outputs.playback.finished_run import FinishedRun, open_run
 from modp_ti.outputs.playback.run_frames import FinishedFrames
 from modp_ti.outputs.progress import ProgressLine
-from pipelines.companions.changes import EarlierVisit
-from pipelines.whole.finished_map import FinishedMap
+from pipelines.companions.changes import ChangeSweep, EarlierVisit
+from pipelines.settings import RefineSettings
+from pipelines.whole.finished_map import FinishedMap, go_on
 
 # Located frames that settle the place of the recording.
 SETTLING = 8
@@ -40,6 +40,84 @@ SETTLING = 8
 MOST_TRIED, MOST_WAITING = 40, 240
 # Least image motion between two frames that are tried, relative to the diagonal: frames from one place say little.
 APART = 0.08
+
+
+class EarlierMap:
+    """The map that a run starts with: an empty one here; subclasses start with that of finished runs.
+
+    Attributes:
+        working: A few words on what `go_on` does, for the progress.
+    """
+
+    working = "starting with an empty map"
+
+    def join(self, tracker: Tracker) -> Tracker:
+        """Return the tracker of the run, whose first frames are those of the earlier map.
+
+        Args:
+            tracker: The opened tracker of the recording, whose events nobody has taken yet.
+
+        Raises:
+            InputError: If the recording does not fit the map.
+        """
+        return tracker
+
+    def go_on(self, mapper: Mapper, arriving: Iterator[Event], digest: StreamDigest) -> None:
+        """Take the frames of the earlier map from the tracker of the run, and put the map into the mapper.
+
+        Args:
+            mapper: A new mapper.
+            arriving: The frames of the tracker that `join` has returned.
+            digest: Takes what was taken from it.
+
+        Raises:
+            InputError: If the map does not fit the settings.
+        """
+
+    def recall(self, mapper: Mapper) -> None:
+        """Give a restored mapper what it needs of the earlier map beside its own state.
+
+        Args:
+            mapper: The mapper of a resumed run.
+        """
+
+    def refinement(self, settings: RefineSettings) -> RefineSettings:
+        """Return the settings of the refinement of the run's map, given those of the run. Call `join` before."""
+        return settings
+
+    @property
+    def seconds(self) -> float:
+        """Time that the frames of this recording took that are in the earlier map [s]."""
+        return 0.0
+
+    @property
+    def notes(self) -> list[str]:
+        """One-line remarks on the earlier map, for the user. They are available after `join`."""
+        return []
+
+    @property
+    def metrics(self) -> dict[str, Any]:
+        """The entries `onto` and `parts` of `metrics.json`, None without such a map."""
+        return {"onto": None, "parts": None}
+
+
+def open_earlier_map(config: SceneConfig, line: ProgressLine) -> EarlierMap:
+    """Return the map that a run starts with.
+
+    Args:
+        config: The scene's settings.
+        line: Shows the progress.
+
+    Raises:
+        InputError: If there is no finished run to go on with, or a damaged one.
+    """
+    if config.onto is not None:
+        return SecondVisit(config, line)
+    if config.parts is None:
+        return EarlierMap()
+    from modp_ti.many.parts import MergedParts  # here, because it loads what many runs need
+
+    return MergedParts(config)
 
 
 class SecondVisit(EarlierMap):
@@ -61,9 +139,8 @@ class SecondVisit(EarlierMap):
         self._line = line
         self._run = open_run(config.onto)
         self._earlier = FinishedFrames(self._run, line.prepare)
-        self._exposures = read_exposures(self._run.folder / "exposure.json")
-        self._masks = read_masks(self._run.folder / "masks")
         self._alignment: WorldAlignment
+        self.working = f"going on with {config.onto}"
 
     def join(self, tracker: Tracker) -> Tracker:
         """Locate the first frames of a tracker in the map. The device is started again.
@@ -98,10 +175,6 @@ class SecondVisit(EarlierMap):
         ]
 
     @property
-    def working(self) -> str:
-        return f"going on with {self._config.onto}"
-
-    @property
     def metrics(self) -> dict[str, Any]:
         found = self._alignment
         entry = {
@@ -113,7 +186,7 @@ class SecondVisit(EarlierMap):
         }
         return super().metrics | {"onto": entry}
 
-    def go_on(self, mapper: Mapper, arriving: Iterator[TrackedFrame | PoseCorrection], digest: StreamDigest) -> None:
+    def go_on(self, mapper: Mapper, arriving: Iterator[Event], digest: StreamDigest) -> None:
         """Take the frames of the finished run from the joined tracker, and put its map into the mapper.
 
         Raises:
@@ -127,33 +200,36 @@ class SecondVisit(EarlierMap):
                 digest.add(frame)
                 yield frame
 
-        record = self._run.record
-        finished = FinishedMap(
-            self._run.gaussians,
-            frames(),
-            set(record.keyframes),
-            self._exposures,
-            record.scene_depth,
-            masks=self._masks,
-        )
-        mapper.frames.origin = record.origin
+        run = self._run
+        mapper.frames.origin = run.record.origin
         try:
-            mapper.go_on_with(finished)
+            go_on(mapper.online, finished_map(run, mapper.noted(frames())))
         except ValueError as error:
             raise InputError(
-                f"{self._run.folder}: its map does not fit these settings ({error}); map both with the same ones"
+                f"{run.folder}: its map does not fit these settings ({error}); map both with the same ones"
             ) from None
         self.recall(mapper)
 
     def recall(self, mapper: Mapper) -> None:
-        mapper.watch_changes(EarlierVisit(self._run.gaussians, len(self._run)))
+        map_, earlier = mapper.online, EarlierVisit(self._run.gaussians, len(self._run))
+        map_.companions.append(ChangeSweep(earlier, map_.gaussians, map_.keyframes, map_.renderer, map_.paging))
 
 
-def _settled(
-    locator: Locator, events: Iterator[TrackedFrame | PoseCorrection], line: ProgressLine
-) -> tuple[list[TrackedFrame | PoseCorrection], WorldAlignment]:
+def finished_map(run: FinishedRun, frames: Iterable[TrackedFrame]) -> FinishedMap:
+    """Return the map of a finished run.
+
+    Args:
+        run: The run.
+        frames: Its frames, as for `FinishedMap`.
+    """
+    exposures, masks = read_exposures(run.folder / "exposure.json"), read_masks(run.folder / "masks")
+    record = run.record
+    return FinishedMap(run.gaussians, frames, set(record.keyframes), exposures, record.scene_depth, masks=masks)
+
+
+def _settled(locator: Locator, events: Iterator[Event], line: ProgressLine) -> tuple[list[Event], WorldAlignment]:
     """Take frames until enough of them are located. Returns what was taken, and the alignment of the two worlds."""
-    taken: list[TrackedFrame | PoseCorrection] = []
+    taken: list[Event] = []
     placed: list[PlacedFrame] = []
     last: TrackedFrame | None = None
     tried = 0
@@ -170,17 +246,13 @@ def _settled(
                     reason = found
                 else:
                     placed.append(found)
-            if len(placed) >= SETTLING or tried == MOST_TRIED or len(taken) == MOST_WAITING:
-                alignment = world_alignment(placed)
-                if alignment is not None:
-                    return taken, alignment
-                if tried == MOST_TRIED or len(taken) == MOST_WAITING:
-                    break
-        else:
-            alignment = world_alignment(placed)
-            if alignment is not None:
-                return taken, alignment
-    raise InputError(_not_located(len(placed), tried, reason))
+            ended = tried == MOST_TRIED or len(taken) == MOST_WAITING
+            if ended or (len(placed) >= SETTLING and world_alignment(placed) is not None):
+                break
+        alignment = world_alignment(placed)
+    if alignment is None:
+        raise InputError(_not_located(len(placed), tried, reason))
+    return taken, alignment
 
 
 def _not_located(placed: int, tried: int, reason: str) -> str:

@@ -83,9 +83,6 @@ def open_tracker(config: SceneConfig, progress: Progress | None = None) -> Track
         tracker = config.tracker.open(config, progress)
     if config.source.part is None:
         return tracker
-    from modp_ti.inputs.replay import ReplayedTracker
-
-    assert isinstance(tracker, ReplayedTracker), "SceneConfig refuses parts of other recordings"
     return tracker.within(*config.source.part)
 
 

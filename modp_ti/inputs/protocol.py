@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
-from modp_ti.files.errors import UnreadableImageError
+from modp_ti.files.errors import InputError, UnreadableImageError
 
 if TYPE_CHECKING:
+    from modp_ti.inputs.replay import PosedImage
     from modp_ti.inputs.sources import Picture, Undistorter
 
 Event = TrackedFrame | PoseCorrection
@@ -75,6 +76,9 @@ class Tracker(ABC):
 
     corrects: ClassVar[bool] = False
     """Whether corrections of earlier frames may come between the frames."""
+
+    frames: Sequence[PosedImage] = ()
+    """The images with their poses and points in order, of a tracker that has all of them once it is open."""
 
     @property
     @abstractmethod
@@ -155,6 +159,26 @@ class Tracker(ABC):
     def kept(self) -> Mapping[str, Mapping[str, str | None]]:
         """Settings, by section, that read again what a live tracker keeps until `close`; empty for other trackers."""
         return {}
+
+    def sampled(self, apart: int, each: int, blocks: int) -> Iterator[tuple[int, TrackedFrame]]:
+        """Yield place and frame of some images of `frames`, but of damaged ones: of rigs the first view.
+
+        Args:
+            apart: Images from one to the next of a block, fewer in a short recording.
+            each: Images of a block.
+            blocks: Number of blocks, which are spread evenly.
+        """
+        return iter(())
+
+    def within(self, first: int, end: int) -> Tracker:
+        """Deliver only those of `frames` at the positions from `first` to before `end`, and return this tracker.
+
+        Their indices count from 0. The same frames are held out as in the whole recording.
+
+        Raises:
+            InputError: If the recording has no such frames.
+        """
+        raise InputError("source.part needs a tracker with given poses")
 
     def close(self) -> None:  # noqa: B027 - most trackers hold nothing open
         """Release open resources, such as a camera, a file or a socket."""

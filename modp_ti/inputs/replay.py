@@ -66,26 +66,12 @@ class ReplayedTracker(Tracker):
         self._part = range(len(self.frames))
 
     def within(self, first: int, end: int) -> ReplayedTracker:
-        """Deliver only the frames at the positions from `first` to before `end`, and return this tracker.
-
-        Their indices count from 0. The same frames are held out as in the whole recording.
-
-        Raises:
-            InputError: If the recording has no such frames.
-        """
         if end > len(self.frames):
             raise InputError(f"source.part ends at {end}, and the tracker has {len(self.frames)} frames: lower it")
         self._part = range(first, end)
         return self
 
     def sampled(self, apart: int, each: int, blocks: int) -> Iterator[tuple[int, TrackedFrame]]:
-        """Yield place and frame of some images of the tracker's part, but of damaged ones: of rigs the first view.
-
-        Args:
-            apart: Images from one to the next of a block, fewer in a short recording.
-            each: Images of a block.
-            blocks: Number of blocks, which are spread evenly.
-        """
         views = self._reader.source.panorama.count
         count = len(self._part) // views
         apart = min(apart, max(count // (blocks * each), 1))

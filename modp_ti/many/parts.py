@@ -14,7 +14,6 @@ from typing import Any
 from rich.console import Console
 
 from fields.frames.tracked_frame import TrackedFrame
-from fields.map.covisibility import SeenPoints, covisibility
 from modp_ti.config.settings import SceneConfig
 from modp_ti.engine.mapper import Mapper
 from modp_ti.engine.second_visit import EarlierMap
@@ -31,6 +30,7 @@ from modp_ti.many.task import finished_metrics
 from modp_ti.outputs.formats.run_files import read_exposures
 from modp_ti.outputs.playback.finished_run import FinishedRun, open_run
 from modp_ti.outputs.progress import ProgressLine
+from pipelines.select.keyframes import SeenPoints, covisibility
 from pipelines.settings import RefineSettings
 from pipelines.whole.merge import MappedPart, merge
 

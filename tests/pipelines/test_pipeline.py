@@ -29,7 +29,7 @@ def test_an_offline_map_has_no_budget_and_is_neither_refined_nor_resumed(mapper:
     with pytest.raises(ValueError):
         mapper.refine(5)
     with pytest.raises(ValueError):
-        mapper.state()
+        _ = mapper.online
     with pytest.raises(ValueError):
         mapper.restore(MapState.of({}, {}), DeliveredFrames(), [], finished=True)
 

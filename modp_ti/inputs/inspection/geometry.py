@@ -17,7 +17,7 @@ from modp_ti.inputs.inspection.conventions import CONVENTIONS, STATED, Conventio
 from modp_ti.inputs.inspection.findings import Finding, Severity, note, unusable, warning
 from modp_ti.inputs.inspection.survey import GAPS, MatchedPair, Survey, survey
 from modp_ti.inputs.multiview.features import essential_matrix
-from modp_ti.inputs.replay import ReplayedTracker
+from modp_ti.inputs.protocol import Tracker
 
 FITTING = 2.5  # px of the image used for detection, threshold of a fitting match
 # Smallest angle [degrees] between the rays of a match at which the sign of its depth is reliable.
@@ -217,7 +217,7 @@ def _code(convention: Convention) -> str:
     return convention.name.lower().replace(" ", "_")
 
 
-def first_look(tracker: ReplayedTracker) -> Geometry | None:
+def first_look(tracker: Tracker) -> Geometry | None:
     """Measure how some frames of a tracker fit their poses, None without any. The tracker stays at its start."""
     looked_at = list(tracker.sampled(APART, GAPS[-1] + 1, PLACES))
     if not looked_at:
@@ -231,7 +231,7 @@ def first_look(tracker: ReplayedTracker) -> Geometry | None:
     return measure_geometry(seen, further)
 
 
-def require_fitting(tracker: ReplayedTracker) -> None:
+def require_fitting(tracker: Tracker) -> None:
     """Raise InputError if the poses of a tracker cannot be those of its images."""
     geometry = first_look(tracker)
     reason = None if geometry is None else nonsense(geometry)

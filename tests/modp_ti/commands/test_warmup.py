@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from fields.runtime.engine import engine
 from modp_ti.commands import app as cli
-from modp_ti.engine import build
+from modp_ti.engine import mapper
 from tests.patience import PATIENCE
 
 SCENE = """
@@ -50,7 +50,7 @@ def test_a_realtime_run_is_compiled_for_the_images_that_it_expects(arguments, si
     (tmp_path / "live.yaml").write_text("{tracker: {kind: socket}, output: out, device: cpu}")
     monkeypatch.chdir(tmp_path)
     cameras = []
-    monkeypatch.setattr(build, "build_mapper", lambda _, camera: cameras.append(camera) or MagicMock())
+    monkeypatch.setattr(mapper, "build_mapper", lambda _, camera: cameras.append(camera) or MagicMock())
     result = CliRunner().invoke(cli.app, ["warmup", *arguments])
     assert result.exit_code == 0, result.stderr
     assert [(camera.width, camera.height) for camera in cameras] == [size]

@@ -11,7 +11,7 @@ import pytest
 
 from modp_ti.config.scene_file import load_scene
 from modp_ti.engine.session import run_scene
-from modp_ti.many.scenes import finished_metrics
+from modp_ti.many.task import finished_metrics
 from modp_ti.outputs.formats.trajectory import read_trajectory
 from tests.modp_ti.inputs.klt.conftest import BoxRoom, Walk, box_room, walk  # noqa: F401 (a fixture)
 

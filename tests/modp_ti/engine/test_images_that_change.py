@@ -14,8 +14,8 @@ import pytest
 from rich.console import Console
 
 from modp_ti.config.scene_file import load_scene
-from modp_ti.engine import session
-from modp_ti.engine.observer import Observer
+from modp_ti.engine import session, stages
+from modp_ti.engine.stream import Observer
 from modp_ti.files.errors import InputError
 from tests.fault_injection.recordings import write_recording
 
@@ -66,7 +66,7 @@ def test_the_other_frames_keep_their_scores_and_pictures(
     name = f"{PLACE:06d}.png"
     file = folder / "images" / name
     meddle = others(np.asarray(cv2.imread(str(file))))[what]
-    monkeypatch.setattr(session, "open_observer", lambda *_: Meddler(lambda: meddle(file)))
+    monkeypatch.setattr(stages, "open_observer", lambda *_: Meddler(lambda: meddle(file)))
     said = io.StringIO()
     session.run_scene(load_scene(folder / "scene.yaml", KEEP), Console(file=said, width=1000))
     expected = scores(recording / "out")
@@ -91,7 +91,7 @@ def test_an_image_that_heals_was_not_mapped_and_is_not_scored(
         whole = file.read_bytes()
         file.write_bytes(whole[:500])
         meddler = Meddler(lambda file=file, whole=whole, heals=heals: heals and file.write_bytes(whole))
-        monkeypatch.setattr(session, "open_observer", lambda *_, meddler=meddler: meddler)
+        monkeypatch.setattr(stages, "open_observer", lambda *_, meddler=meddler: meddler)
         session.run_scene(load_scene(folder / "scene.yaml", KEEP))
         results.append(scores(folder / "out"))
     assert results[0] == results[1] and len(results[0]) == FRAMES - 1
@@ -102,7 +102,7 @@ def test_without_any_image_there_are_no_scores_but_the_map(
 ) -> None:
     folder = tmp_path / "lost"
     shutil.copytree(recording, folder, ignore=shutil.ignore_patterns("out"))
-    monkeypatch.setattr(session, "open_observer", lambda *_: Meddler(lambda: shutil.rmtree(folder / "images")))
+    monkeypatch.setattr(stages, "open_observer", lambda *_: Meddler(lambda: shutil.rmtree(folder / "images")))
     with pytest.raises(InputError, match="without its scores"):
         session.run_scene(load_scene(folder / "scene.yaml", KEEP))
     assert (folder / "out" / "splats.ply").read_bytes() == (recording / "out" / "splats.ply").read_bytes()

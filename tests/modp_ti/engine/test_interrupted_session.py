@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 from modp_ti.config.scene_file import load_scene
-from modp_ti.engine import results, session
-from modp_ti.engine.observer import Observer
-from modp_ti.engine.snapshots import load_resumed
+from modp_ti.engine import results, session, stages
+from modp_ti.engine.resume import load_resumed
+from modp_ti.engine.stream import Observer
 from modp_ti.files.errors import InputError
 from modp_ti.files.run_folder import appearing
 from modp_ti.outputs.formats.splats_ply import read_splats
@@ -79,7 +79,7 @@ class Presser(Observer):
 def test_ctrl_c_after_the_recording_has_ended_saves_the_map_so_far(
     observer: Presser, scene: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(session, "open_observer", lambda *_: observer)
+    monkeypatch.setattr(stages, "open_observer", lambda *_: observer)
     with pytest.raises(KeyboardInterrupt) as stopped:
         session.run_scene(load_scene(scene))
     out = scene.parent / "out"
@@ -153,7 +153,7 @@ def test_the_finished_map_is_there_before_its_scores_and_stays_without_room_for_
         (earlier / "renders").mkdir()
         (earlier / "renders" / "000000.png").touch()
     watcher = Watcher(out)
-    monkeypatch.setattr(session, "open_observer", lambda *_: watcher)
+    monkeypatch.setattr(stages, "open_observer", lambda *_: watcher)
     monkeypatch.setattr(results, "write_scores", full)
     with pytest.raises(InputError) as error:
         session.run_scene(load_scene(scene, ["source.stop=12", "refine.seconds=null", "refine.steps=2"]))
@@ -219,7 +219,7 @@ def test_a_map_whose_folder_is_gone_is_saved_where_the_error_says(
             out.mkdir()
             (out / "splats.ply").write_text("mine")
 
-    monkeypatch.setattr(session, "open_observer", lambda *_: Saboteur(stage, sabotage))
+    monkeypatch.setattr(stages, "open_observer", lambda *_: Saboteur(stage, sabotage))
     said = ""
     try:
         session.run_scene(load_scene(recorded))
@@ -244,7 +244,7 @@ def test_a_fault_on_the_way_names_the_snapshot(
     def fail() -> None:
         raise fault
 
-    monkeypatch.setattr(session, "open_observer", lambda *_: Saboteur(stage, fail))
+    monkeypatch.setattr(stages, "open_observer", lambda *_: Saboteur(stage, fail))
     with pytest.raises(type(fault)) as raised:
         session.run_scene(load_scene(recorded, ["snapshot_every=2"]))
     assert f"--resume {recorded.parent / 'out'}" in repr(raised.value)

@@ -14,8 +14,8 @@ from fields.frames.tracked_frame import TrackedFrame
 from fields.runtime.backend import initialise
 from modp_ti.engine.interruption import Interruption, RunStopped
 from modp_ti.engine.mapper import Mapper
-from modp_ti.engine.prefetch import FramesAhead
 from modp_ti.engine.realtime import RealtimeRun
+from modp_ti.engine.stream import FramesAhead
 from modp_ti.inputs.protocol import LiveCounts, Tracker
 from modp_ti.inputs.sources import Picture
 from pipelines.settings import DensifySettings, MappingSettings, OptimiseSettings

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from modp_ti.commands.app import app
 from modp_ti.engine import refined_run
 from modp_ti.engine.refined_run import refine_run
-from modp_ti.engine.snapshots import FILE
+from modp_ti.engine.snapshot import FILE
 from modp_ti.files.run_folder import PRIVATE
 from modp_ti.outputs.formats.run_files import read_scores
 from modp_ti.outputs.formats.splats_ply import read_splats

@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 
 from fields.frames.origin import shifted_poses
 from fields.geometry.se3 import exp_se3, inverse_se3, moved_points, moved_pose
-from modp_ti.engine.snapshots import FILE
+from modp_ti.engine.snapshot import FILE
 from modp_ti.outputs.formats.run_files import read_masks, read_scores
 from modp_ti.outputs.formats.splats_ply import read_splats
 from modp_ti.outputs.formats.trajectory import read_trajectory, write_trajectory
 from modp_ti.outputs.playback.finished_run import open_run
-from tests.modp_ti.engine.snapshots.test_resume import position, stop_midway
+from tests.modp_ti.engine.test_resume import position, stop_midway
 from tests.modp_ti.outputs.locating.painted_room import CAMERA, another_room, write_run
 from tests.modp_ti.runs import run
 from tests.room import Room, RoomRecording, walk, write_colmap

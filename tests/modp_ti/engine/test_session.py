@@ -19,8 +19,8 @@ from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from fields.runtime.engine import engine
 from modp_ti.config.scene_file import load_scene
-from modp_ti.engine import session
-from modp_ti.engine.build import build_mapper
+from modp_ti.engine import session, stages
+from modp_ti.engine.mapper import build_mapper
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.delivered_frames import DeliveredFrames
 from modp_ti.inputs.opening import open_tracker
@@ -296,8 +296,8 @@ class DeafMapper:
 def test_a_tracker_is_closed_and_heard_to_its_end_however_the_run_ends(scene, monkeypatch):
     config = load_scene(scene)
     tracker = LiveTracker()
-    monkeypatch.setattr(session, "open_tracker", lambda *_: tracker)
-    monkeypatch.setattr(session, "build_mapper", lambda *_: DeafMapper())
+    monkeypatch.setattr(stages, "open_tracker", lambda *_: tracker)
+    monkeypatch.setattr(stages, "build_mapper", lambda *_: DeafMapper())
     said = io.StringIO()
     with pytest.raises(InputError, match="no frame became a keyframe"):
         session.run_scene(config, Console(file=said, width=200))
@@ -314,9 +314,9 @@ def test_a_realtime_run_makes_a_larger_mapper_only_for_images_larger_than_expect
         sides.append(camera.width)
         return build_mapper(config, camera, pace)
 
-    monkeypatch.setattr(session, "EXPECTED", PinholeCamera(1.0, 1.0, 8.0, 8.0, expected, expected))
+    monkeypatch.setattr(stages, "EXPECTED", PinholeCamera(1.0, 1.0, 8.0, 8.0, expected, expected))
     monkeypatch.setattr(ReplayedTracker, "largest", (0, 0))  # a live tracker does not know
-    monkeypatch.setattr(session, "build_mapper", noted)
+    monkeypatch.setattr(stages, "build_mapper", noted)
     output = session.run_scene(load_scene(scene, ["mapping.pace=realtime"]))
     assert sides == made
     metrics = json.loads((output / "metrics.json").read_text())

@@ -366,7 +366,7 @@ def test_the_address_is_printed_even_if_nothing_else_is():
     from rich.console import Console
 
     from modp_ti.config.settings import ViewSettings
-    from modp_ti.engine.build import open_observer
+    from modp_ti.engine.stream import open_observer
     from modp_ti.outputs.progress import ProgressLine
 
     for host, lines in (("127.0.0.1", 1), ("0.0.0.0", 2)):  # and a line that the page is open to other machines

@@ -1,24 +1,29 @@
-"""Resuming a run: from its snapshot, or from the frames that a killed live run has kept."""
+"""Stopping before the end, which saves the map so far; and resuming, from a snapshot or what a killed live run kept."""
 
 from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from fields.frames.tracked_frame import TrackedFrame
 from modp_ti.config.keys import as_yaml, differing_keys, leaves
 from modp_ti.config.scene_file import dump_scene, load_scene, scene_from_data
 from modp_ti.config.settings import SceneConfig
+from modp_ti.engine.interruption import RunStopped
 from modp_ti.engine.mapper import Mapper
-from modp_ti.engine.snapshots.snapshot import FILE, Snapshot, StreamDigest, of_another_program
+from modp_ti.engine.results import Results
+from modp_ti.engine.snapshot import AGAIN, FILE, Checkpointer, Snapshot, StreamDigest, of_another_program
 from modp_ti.files.errors import InputError
+from modp_ti.files.reading import reading
 from modp_ti.files.run_folder import appearing, list_files
 from modp_ti.files.storage import Storage
 from modp_ti.inputs.protocol import Event, Tracker
 from modp_ti.inputs.readers.socket import SocketSettings
 from modp_ti.inputs.sources.frame_store import list_frames
+from pipelines.companions.block_files import BlockError
 
 # Scene file in the output folder, which is there only while a live run goes on, or if it was killed.
 RECORDING = "recording.yaml"
@@ -155,7 +160,7 @@ def replay(snapshot: Snapshot, mapper: Mapper, arriving: Iterator[Event], digest
             if isinstance(event, TrackedFrame) and not event.held_out:
                 yield event
 
-    with snapshot.fitting():
+    with reading(snapshot.path, AGAIN):
         mapper.restore(snapshot.map, snapshot.frames(mapper.pipeline.trajectory), frames(), position.finished)
         mapper.pipeline.stopwatch.seconds |= {key: snapshot.number("watch", key) for key in snapshot.numbers["watch"]}
     if digest.value != position.digest:
@@ -232,3 +237,54 @@ def discard(output: Path) -> None:
         if place is not None and (folder := place.parent if place.is_file() else place).name.startswith(KEPT):
             shutil.rmtree(folder, ignore_errors=True)
         file.unlink()
+
+
+@contextmanager
+def saving(mapper: Mapper, keeper: Checkpointer, results: Callable[[], Results]) -> Iterator[None]:
+    """Save the map so far if the run stops inside this context, and add to errors how to continue.
+
+    After Ctrl-C, a snapshot and the map are written. If a part of the map on disk is damaged, the map is written
+    without it, and the last snapshot stays as it was.
+
+    Args:
+        mapper: The mapper.
+        keeper: Writes the run's snapshots.
+        results: Returns what writes the map to the output folder.
+
+    Raises:
+        KeyboardInterrupt: After Ctrl-C, with a message.
+        InputError: If a part of the map is damaged.
+    """
+    output = keeper.path.parent
+    try:
+        yield
+    except RunStopped:
+        resumable = keeper.keep() or keeper.usable
+        said = f"interrupted after {len(mapper.frames)} frames{_saved(mapper, keeper, results())}"
+        raise KeyboardInterrupt(f"{said}; modp-ti run --resume {output} goes on" if resumable else said) from None
+    except BlockError as error:
+        raise InputError(f"{error}{_saved(mapper, keeper, results())}{keeper.way_on()}") from None
+    except Exception as error:
+        if way_on := keeper.way_on():
+            error.args = (f"{error}{way_on}",)
+        raise
+
+
+def _saved(mapper: Mapper, keeper: Checkpointer, results: Results) -> str:
+    """Save the map, and return the part of a message that says where it is, or "" if there is none yet."""
+    pipeline = mapper.pipeline
+    if not len(pipeline.keyframes):
+        return ""
+    while True:
+        try:
+            version = mapper.version()
+            break
+        except BlockError:
+            continue  # without the damaged block, of which there are finitely many
+    try:
+        with results.writing_map():
+            results.write_map(version, pipeline.keyframes, pipeline.near)
+    except InputError as error:
+        way_on = keeper.way_on() or results.elsewhere(version, pipeline.keyframes, pipeline.near)
+        raise InputError(f"{error}{way_on}") from None
+    return f"; the map so far is in {keeper.path.parent}"

@@ -17,8 +17,8 @@ import numpy as np
 import pycolmap
 import pytest
 
-from modp_ti.engine.snapshots import FILE, Snapshot, load_resumed
-from modp_ti.engine.snapshots.snapshot import Position
+from modp_ti.engine.resume import load_resumed
+from modp_ti.engine.snapshot import FILE, Position, Snapshot
 from modp_ti.files.errors import InputError
 from tests.modp_ti.runs import finished_run
 from tests.patience import PATIENCE

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import threading
 from collections.abc import Iterator
 
@@ -13,8 +11,10 @@ import pytest
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.camera import PinholeCamera
-from modp_ti.engine.prefetch import FramesAhead
-from modp_ti.files.errors import InputError
+from modp_ti.config.scene_file import load_scene
+from modp_ti.engine.session import run_scene
+from modp_ti.engine.stream import FramesAhead
+from modp_ti.files.errors import InputError, UnreadableImageError
 from tests.patience import PATIENCE
 
 CAMERA = PinholeCamera(300.0, 300.0, 120.0, 100.0, 240, 200)
@@ -96,52 +96,30 @@ def test_the_thread_ends_with_the_block_whatever_happens_in_it(frames_taken: int
     assert not reading()
 
 
-RUNS = """
-import sys, threading
-from pathlib import Path
-from modp_ti import load_scene, run_scene
-
-scene = Path(sys.argv[1])
-for prefetch in (0, 3):
-    run_scene(load_scene(scene, [f"source.prefetch={prefetch}", f"output=out{prefetch}"]))
-    assert not [t for t in threading.enumerate() if t.name == "frames ahead"]
-for name in ("splats.ply", "trajectory.txt", "scores.csv"):
-    assert (scene.parent / "out0" / name).read_bytes() == (scene.parent / "out3" / name).read_bytes(), name
-
-picture = scene.parent / "images" / "view11.png"
-data = bytearray(picture.read_bytes())
-data[len(data) // 2 : len(data) // 2 + 2000] = bytes(2000)
-picture.write_bytes(data)
-errors = []
-for prefetch in (0, 3):
-    try:
-        run_scene(load_scene(scene, [f"source.prefetch={prefetch}", "output=bad"]))
-    except Exception as error:
-        errors.append((type(error).__name__, str(error)))
-    assert not [t for t in threading.enumerate() if t.name == "frames ahead"]
-assert len(errors) == 2 and errors[0] == errors[1], errors
-assert errors[0][0] == "UnreadableImageError" and "view11.png" in errors[0][1], errors
-"""
-
-
 @pytest.mark.slow
 def test_a_run_gives_the_same_map_and_the_same_error_with_and_without(plane_scene) -> None:
     x, y = np.meshgrid(np.linspace(-1.2, 1.2, 9), np.linspace(-0.9, 0.9, 7))
     plane_scene.write_colmap(np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1))
     scene = plane_scene.folder.parent / "scene.yaml"
     scene.write_text(
-        "source: {path: images, holdout: 4}\ntracker: {kind: colmap, path: sparse/0}\noutput: out\ndevice: cpu\n"
-        "mapping: {optimise: {steps: 2}, densify: {pixels: 400}}\nrefine: {steps: 2}\n"
+        "source: {path: images, holdout: 4, scale: 0.25}\ntracker: {kind: colmap, path: sparse/0}\noutput: out\n"
+        "device: cpu\nmapping: {optimise: {steps: 2}, densify: {pixels: 200}}\nrefine: {steps: 2}\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", RUNS, str(scene)],
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE,
-        check=False,
-        cwd=scene.parent,
-    )
-    assert done.returncode == 0, done.stderr
+    outputs = [run_scene(load_scene(scene, [f"source.prefetch={n}", f"output=out{n}"])) for n in (0, 3)]
+    for name in ("splats.ply", "trajectory.txt", "scores.csv"):
+        first, second = ((output / name).read_bytes() for output in outputs)
+        assert first == second, name
+
+    picture = plane_scene.folder / "view11.png"
+    data = bytearray(picture.read_bytes())
+    data[len(data) // 2 : len(data) // 2 + 2000] = bytes(2000)
+    picture.write_bytes(data)
+    errors = []
+    for prefetch in (0, 3):
+        with pytest.raises(UnreadableImageError, match=r"view11\.png") as error:
+            run_scene(load_scene(scene, [f"source.prefetch={prefetch}", "output=bad"]))
+        errors.append(str(error.value))
+    assert errors[0] == errors[1]
 
 
 def test_what_is_there_is_known_before_it_is_taken() -> None:
@@ -169,7 +147,13 @@ def test_what_is_there_is_known_before_it_is_taken() -> None:
 
 
 @pytest.mark.parametrize("ahead", [0, 3])
-def test_what_is_put_back_comes_next(ahead: int) -> None:
+def test_the_first_frame_stays_the_next_one(ahead: int) -> None:
     with FramesAhead(Source(3), ahead) as frames:
-        frames.put_back(next(frames))
+        assert frames.first_frame().index == 0
         assert [frame.index for frame in frames] == [0, 1, 2]
+    correction = PoseCorrection(np.arange(1), np.eye(4)[None])
+    for events in ([], [correction]):
+        with FramesAhead(events, ahead) as frames, pytest.raises(InputError):
+            frames.first_frame()
+    with FramesAhead(Source(3, bad=0), ahead) as frames, pytest.raises(InputError, match="damaged"):
+        frames.first_frame()
