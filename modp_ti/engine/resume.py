@@ -22,7 +22,7 @@ from modp_ti.files.run_folder import appearing, list_files
 from modp_ti.files.storage import Storage
 from modp_ti.inputs.protocol import Event, Tracker
 from modp_ti.inputs.readers.socket import SocketSettings
-from modp_ti.inputs.sources.frame_store import list_frames
+from modp_ti.inputs.sources.live import list_frames
 from pipelines.companions.block_files import BlockError
 
 # Scene file in the output folder, which is there only while a live run goes on, or if it was killed.

@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from math import floor
+from pathlib import Path
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -49,6 +50,15 @@ class Arrivals:
     arrived: int
     thinned: int
     newest: float
+
+    def notes(self, source: Path) -> list[str]:
+        """Return a remark on the frames of a source that were left out, if any."""
+        if not self.thinned:
+            return []
+        return [
+            f"{self.thinned} of {self.arrived} frames of {source} came faster than they could be tracked and were left "
+            "out evenly"
+        ]
 
 
 class Backlog(Generic[Item]):
@@ -123,11 +133,10 @@ class Backlog(Generic[Item]):
 
     def clear(self) -> None:
         """Remove all waiting frames, and count them as if they had not arrived."""
-        self._arrived -= len(self._waiting)
+        count = len(self._waiting)
+        self._arrived, self._thinned = self._arrived - count, self._thinned - count
         while self._waiting:
-            _, item = self._waiting.popleft()
-            if self._drop is not None and item is not None:
-                self._drop(item)
+            self._leave_out(self._waiting.popleft()[1])
 
     def _leave_out(self, item: Item | None) -> None:
         self._thinned += 1

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from modp_ti.files import read_text
 from modp_ti.inputs.sources.image_pixels import quiet_opencv
 
 LINUX_DEVICES = Path("/sys/class/video4linux")
@@ -62,25 +61,17 @@ def _opened(number: int, name: str = "") -> Camera:
     with quiet_opencv():
         try:
             capture = cv2.VideoCapture(number)
-        except cv2.error:
-            return Camera(number, name, opens=False)
-        try:
             if not capture.isOpened():
                 return Camera(number, name, opens=False)
             width, height = (round(capture.get(key)) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
             fps = capture.get(cv2.CAP_PROP_FPS)
-        except cv2.error:
-            width = height = 0
-            fps = 0.0
-        finally:
             capture.release()
+        except cv2.error:
+            return Camera(number, name, opens=False)
     # OpenCV answers 0 or -1 for what it does not know.
     known = width > 0 and height > 0
     return Camera(number, name, width if known else None, height if known else None, fps if fps > 0 else None)
 
 
 def _content(file: Path) -> str:
-    try:
-        return read_text(file).strip()
-    except (OSError, UnicodeDecodeError):
-        return ""
+    return file.read_text(errors="replace").strip() if file.is_file() else ""

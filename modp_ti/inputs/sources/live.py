@@ -11,18 +11,20 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fields.runtime.process import has_room
 from modp_ti.files.errors import InputError
 from modp_ti.files.processes import RecordingInterrupt
 from modp_ti.files.urls import shown_url
 from modp_ti.inputs.sources.backlog import Arrivals, Backlog
-from modp_ti.inputs.sources.frame_store import FrameStore, kept_frames
-from modp_ti.inputs.sources.image_pixels import quiet_opencv
+from modp_ti.inputs.sources.image_header import read_image_header
+from modp_ti.inputs.sources.image_pixels import decoded, quiet_opencv
 from modp_ti.inputs.sources.protocol import ImageSource
 
 # Memory [bytes] of decoded frames that wait for the tracker. Further ones wait on disk.
@@ -102,12 +104,7 @@ class LiveSource(ImageSource):
             f"{self.path} is mapped live: Ctrl-C ends the recording, and the map is finished with what came",
             *self._notes,
         ]
-        counts = self.arrivals
-        if counts.thinned:
-            notes.append(
-                f"{counts.thinned} of {counts.arrived} frames of {self.path} came faster than they could be tracked "
-                "and were left out evenly"
-            )
+        notes += self.arrivals.notes(self.path)
         if self.ending is not None:
             notes.append(f"the recording ended: {self.ending}")
         return notes
@@ -163,15 +160,15 @@ class LiveSource(ImageSource):
 
     def finish(self) -> None:
         """End the recording. Frames that have arrived are still delivered."""
-        with self._changed:
-            self._ended = True
-            self._changed.notify_all()
+        self._end_now(forget=False)
 
-    def _end_now(self) -> None:
-        """End the recording and forget the frames that wait."""
+    def _end_now(self, why: str | None = None, forget: bool = True) -> None:
+        """End the recording, for a reason if it was not asked to, and forget the frames that wait."""
         with self._changed:
+            self._end = why or self._end
             self._ended = True
-            self._backlog.clear()
+            if forget:
+                self._backlog.clear()
             self._changed.notify_all()
 
     def close(self) -> None:
@@ -214,18 +211,16 @@ class LiveSource(ImageSource):
                 if frame is None:
                     waited = time.monotonic() - asked
                     sent = f"sent nothing for {waited:.0f} s" if waited >= PAUSE else "sends no more frames"
-                    self._end = f"{self.path} {sent}"
-                    self.finish()
+                    self._end_now(f"{self.path} {sent}", forget=False)
                 else:
                     self._add(*frame)
             except InputError as error:
-                self._end = str(error)
-                self.finish()
+                self._end_now(str(error), forget=False)
         self._capture.release()
 
     def _add(self, arrived: float, image: NDArray[np.uint8] | None) -> None:
         """Let a frame wait, on disk if there is no room in memory. Raises InputError if the disk is full."""
-        captured = _Captured(image, self._store.waiting_file(self._backlog.arrivals.arrived))
+        captured = _Captured(image, self._store.folder / f"waiting-{self._backlog.arrivals.arrived:06d}.png")
         if image is not None and self._held + image.nbytes > MEMORY:
             self._store.write(captured.file, image)
             captured.image = None
@@ -262,23 +257,23 @@ class LiveSource(ImageSource):
                 except InputError as error:
                     if not self._names:
                         raise
-                    self._end = str(error)
-                    self._end_now()
+                    self._end_now(str(error))
                     return False
             return True
 
     def _keep(self, arrived: float, captured: _Captured) -> None:
         """Store a frame under its number. Raises InputError if the disk is full."""
-        number = len(self._names)
-        name = self._store.name(number)
+        number, time_taken = len(self._names), self._epoch + arrived
+        name, file = f"live_{number:06d}", self._store.file(number)
         if captured.image is None:
-            self._store.deliver(captured.file, number)
+            os.replace(captured.file, file)
         else:
-            self._store.write(self._store.file(number), captured.image)
+            self._store.write(file, captured.image)
             self._last = name, captured.image  # the tracker reads it next, so it need not be decoded
-        self._store.date(number, self._epoch + arrived)
+        with suppress(OSError):  # on file systems that keep no such times
+            os.utime(file, (time_taken, time_taken))  # for `list_frames`
         self._received.append(arrived)
-        self._append(name, self._epoch + arrived)
+        self._append(name, time_taken)
 
     def _interrupted(self) -> bool:
         """End the recording in a signal handler; return whether it was going on."""
@@ -320,3 +315,92 @@ def _open(stream: int | str):
         what = "no such camera, or it is in use" if isinstance(stream, int) else "no stream that can be opened"
         raise InputError(f"{_shown(stream)}: {what} (source.stream)")
     return capture
+
+
+# ---- the frames on disk --------------------------------------------------------------------------------------------
+
+
+def kept_frames(folder: Path) -> dict[str, dict[str, str | None]]:
+    """Return the settings that read the delivered frames again, see `Tracker.kept`."""
+    return {"source": {"stream": None, "path": str(folder), "kind": "tum_rgbd"}}
+
+
+def list_frames(folder: Path) -> None:
+    """Write the list that makes the folder of a killed process a recording. Raises OSError if it cannot be written."""
+    lines = []
+    for file in sorted(folder.glob("[0-9]*.png")):
+        with file.open("rb") as image:
+            header = read_image_header(image)
+        if header is not None and header.complete:  # the last one may be cut off
+            lines.append(f"{file.stat().st_mtime_ns / 1e9!r} {file.name}\n")
+    (folder / "rgb.txt").write_text("".join(lines), encoding="utf-8")
+
+
+class FrameStore:
+    """Frames of a live source by number, as PNG files.
+
+    Args:
+        folder: The folder, which exists.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def file(self, number: int) -> Path:
+        """Place of the n-th delivered frame."""
+        return self.folder / f"{number:06d}.png"
+
+    def write(self, file: Path, image: NDArray[np.uint8]) -> None:
+        """Store a frame (H, W, 3) BGR in one of these files.
+
+        Raises:
+            InputError: If it cannot be written, or would leave too little of the disk free.
+        """
+        import cv2
+
+        # Huffman coding of differences to the left takes half the time of OpenCV's default for the same size.
+        how = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY]
+        if hasattr(cv2, "IMWRITE_PNG_FILTER"):  # since OpenCV 4.11
+            how += [cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB]
+        _, data = cv2.imencode(".png", image, how)
+        try:
+            if not has_room(self.folder, len(data)):
+                raise InputError(
+                    f"{self.folder.parent}: less than 1 GiB is free for the frames of the live source; make room, or "
+                    "set TMPDIR to a folder that has some"
+                )
+            file.write_bytes(data.data)
+        except OSError as error:
+            file.unlink(missing_ok=True)
+            raise InputError(
+                f"{self.folder}: frames of the live source cannot be kept there: {error.strerror}; "
+                "make room, or set TMPDIR to a folder that has some"
+            ) from None
+
+    def read(self, name: str) -> NDArray[np.uint8]:
+        """Read a delivered frame (H, W, 3) uint8 RGB.
+
+        Raises:
+            InputError: If the file is missing or damaged.
+        """
+        file = self.file(int(name.rpartition("_")[2]))
+        image = decoded(file.read_bytes()) if file.is_file() else None
+        if image is None:
+            raise InputError(f"{file}: the frame that was kept there is gone or damaged: leave the folder alone")
+        return image
+
+
+class StoredFrames(ImageSource):
+    """The stored frames of a recording that has ended, for a process that did not record it.
+
+    Args:
+        folder: The folder of a `FrameStore`.
+        names: Names of the frames, in order.
+    """
+
+    def __init__(self, folder: Path, names: Sequence[str]) -> None:
+        super().__init__(folder, names, [0.0] * len(names))
+        self._store = FrameStore(folder)
+
+    def read(self, name: str) -> NDArray[np.uint8]:
+        return self._store.read(name)

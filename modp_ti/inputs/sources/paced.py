@@ -50,14 +50,8 @@ class PacedSource(ImageSource):
 
     @property
     def notes(self) -> list[str]:
-        notes = [*self._images.notes, *self._notes, f"{self.path} is played at the pace of its time stamps"]
-        counts = self.arrivals
-        if counts.thinned:
-            notes.append(
-                f"{counts.thinned} of {counts.arrived} images of {self.path} came faster than they could be tracked "
-                "and were left out evenly"
-            )
-        return notes
+        said = f"{self.path} is played at the pace of its time stamps"
+        return [*self._images.notes, *self._notes, said, *self.arrivals.notes(self.path)]
 
     def arriving(self, start: int, stop: int | None, step: int) -> Iterator[str]:
         names = self.selected(start, stop, step)

@@ -35,8 +35,6 @@ CONTAINERS = (
     "ivf,obu,av1,dv,gxf,mxf,nut,rm,wtv,yuv4mpegpipe,gif,apng,dhav"
 )
 LIMITS = {"max_pixels": str(MAX_IMAGE_PIXELS)}
-# Largest difference from a quarter turn that a display matrix may have [degrees].
-STRAIGHT = 1.0
 # Colour matrices by the number in H.273, as FFmpeg's filter numbers them. HDR with another matrix, or with none, is
 # taken to have that of BT.2020.
 MATRICES = {1: "ITU709", 5: "ITU601", 6: "ITU601"}
@@ -82,7 +80,17 @@ class VideoFile(ImageSource):
         super().__init__(self.path, [f"{self.path.stem}_{i:06d}" for i in range(len(shown))], times)
         height, width = first.shape[:2]
         self._size = (width, height)
-        for note in (*decoder.notes, *self._form.notes(width, height)):
+        notes, form = decoder.notes, self._form
+        if form.turn != AS_STORED:
+            notes.append(
+                f"asks to be {form.turn}, and is: its frames are {width}x{height}, and intrinsics are for that"
+            )
+        if form.transfer is not None:
+            notes.append(
+                f"is HDR ({form.transfer.name}, BT.2020): its colours are converted to BT.709, and {PEAK:g} cd/m2 "
+                f"become a white of {WHITE:g} cd/m2 by the curve of BT.2390"
+            )
+        for note in notes:
             self.add_note(f"{self.path} {note}")
         if not timed:
             self.add_note(f"{self.path} holds no frame times: frame n is taken to be of second n / {fps:g}")
@@ -155,59 +163,30 @@ def _frame_times(shown: NDArray[np.float64], fps: float) -> tuple[NDArray[np.flo
 
 @dataclass(frozen=True)
 class _Form:
-    """What all frames of a video have in common; the first frame tells.
-
-    Attributes:
-        width: Stored width [px]. Frames of another size are scaled to it.
-        height: Stored height [px], likewise.
-        turn: How frames are turned upright.
-        slant: Rotation that the file asks for beyond `turn` [degrees clockwise], which is not done.
-        transfer: Transfer function of HDR video; None for ordinary video.
-        interlaced: Whether a frame is two pictures of different times, which is not undone.
-    """
+    """What all frames of a video have in common; the first frame tells. Frames of another size are scaled to it."""
 
     width: int
     height: int
-    turn: Turn = AS_STORED
-    slant: int = 0
-    transfer: Transfer | None = None
-    interlaced: bool = False
+    turn: Turn
+    transfer: Transfer | None  # of HDR video
 
     @classmethod
     def of(cls, frame: av.VideoFrame) -> _Form:
         transfer = next((each for each in Transfer if each.value == frame.color_trc), None)
-        return cls(frame.width, frame.height, *_turn(frame), transfer, frame.interlaced_frame)
-
-    def notes(self, width: int, height: int) -> Iterator[str]:
-        """Yield what is done to the frames, which become pictures of this width and height [px]."""
-        if self.turn != AS_STORED:
-            yield f"asks to be {self.turn}, and is: its frames are {width}x{height}, and intrinsics are for that"
-        if self.slant:
-            yield f"asks to be turned clockwise by {self.slant} degrees more, which is not done: only quarter turns are"
-        if self.transfer is not None:
-            yield (
-                f"is HDR ({self.transfer.name}, BT.2020): its colours are converted to BT.709, and {PEAK:g} cd/m2 "
-                f"become a white of {WHITE:g} cd/m2 by the curve of BT.2390"
-            )
-        if self.interlaced:
-            yield "is interlaced: convert it first, for example with `ffmpeg -i in -vf bwdif out.mp4`"
+        return cls(frame.width, frame.height, _turn(frame), transfer)
 
 
-def _turn(frame: av.VideoFrame) -> tuple[Turn, int]:
-    """Return how the display matrix turns a frame, and the rest of its rotation [degrees clockwise]."""
+def _turn(frame: av.VideoFrame) -> Turn:
+    """How the display matrix turns a frame, to the nearest quarter turn."""
     try:
         # The stubs lack this key.
         matrix = frame.side_data["DISPLAYMATRIX"]  # pyright: ignore[reportGeneralTypeIssues]
         a, b, _, c, d, *_ = struct.unpack("=9i", bytes(matrix))
     except (KeyError, ValueError, struct.error):  # ValueError: the frame has other data, unknown to PyAV
-        a, b, c, d = 1, 0, 0, 1
+        return AS_STORED
     mirrored = a * d - b * c < 0
-    if a == b == 0:
-        return AS_STORED, 0
     degrees = math.degrees(math.atan2(-b, -a) if mirrored else math.atan2(b, a))
-    quarters = round(degrees / 90)
-    slant = degrees - 90 * quarters
-    return Turn(quarters % 4, mirrored), round(slant) if abs(slant) > STRAIGHT else 0
+    return Turn(round(degrees / 90) % 4, mirrored)
 
 
 class _Decoder:
@@ -217,11 +196,6 @@ class _Decoder:
         path: The video file.
         in_threads: Decode in several threads. This is faster, but damaged parts look different each time.
         form: Size, turn and colours that all frames have; the first frame's if None.
-
-    Attributes:
-        index: Index of the frame that was decoded last, -1 before the first.
-        form: As the argument; if None, it is set when the first image is converted.
-        notes: What there is to say about the file: which of several streams is decoded, and an error that ended it.
 
     Raises:
         OSError: FFmpeg does not recognise the file as a video.
@@ -247,9 +221,9 @@ class _Decoder:
         if not streams:
             self._container.close()
             raise OSError(str(path))
-        by_rank = lambda each: (bool(each.disposition & Disposition.default), each.width * each.height)  # noqa: E731
-        self._stream = max(streams, key=by_rank)
-        self.notes: list[str] = []
+        ranks = [(bool(each.disposition & Disposition.default), each.width * each.height) for each in streams]
+        self._stream = streams[ranks.index(max(ranks))]
+        self.notes: list[str] = []  # on the streams, and an error that ended the file
         if len(streams) > 1:
             sizes = ", ".join(f"{each.width}x{each.height}" for each in streams)
             number = streams.index(self._stream) + 1
@@ -265,8 +239,8 @@ class _Decoder:
         self._tones: ToneMapping | None = None
         self._frame: av.VideoFrame | None = None
         self._frames = self._decoded()
-        self.form = form
-        self.index = -1
+        self.form = form  # set by the first image, if not given
+        self.index = -1  # of the frame that was decoded last
 
     @property
     def shown(self) -> float:
@@ -311,16 +285,17 @@ class _Decoder:
 
     def _decoded(self) -> Iterator[av.VideoFrame]:
         """Yield the frames. Packets that cannot be decoded are skipped, as `ffmpeg` does."""
-        for packet in self._packets():
+        packets: Iterator[av.Packet | None] = self._container.demux(self._stream)
+        while True:
+            try:
+                packet = next(packets)
+            except StopIteration:
+                return
+            except self._errors as error:
+                self.notes.append(f"is cut off or damaged, and mapped up to there ({str(error)[:80]})")
+                packets = iter([None])  # flushes the decoder
+                continue
             try:
                 yield from self._stream.decode(packet)
             except self._errors:
                 continue
-
-    def _packets(self) -> Iterator[av.Packet | None]:
-        """Yield the packets. After a read error, None flushes the decoder."""
-        try:
-            yield from self._container.demux(self._stream)
-        except self._errors as error:
-            self.notes.append(f"is cut off or damaged, and mapped up to there ({str(error)[:80]})")
-            yield None

@@ -23,7 +23,7 @@ from modp_ti.inputs.opening import open_source
 from modp_ti.inputs.protocol import Event, LiveCounts, Progress, Tracker
 from modp_ti.inputs.replay import pictures_again
 from modp_ti.inputs.sources import FrameReader, Picture, Undistorter
-from modp_ti.inputs.sources.frame_store import StoredFrames, kept_frames
+from modp_ti.inputs.sources.live import StoredFrames, kept_frames
 from modp_ti.inputs.tracking_process.exchange import (
     CameraRevised,
     CountsBoard,

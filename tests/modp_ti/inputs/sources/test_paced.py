@@ -74,7 +74,7 @@ def test_what_a_slow_tracker_cannot_take_is_thinned_evenly(folder):
         clock.now += 0.06
     assert set(np.diff(names)) == {1, 2} and np.diff(names)[8:].mean() > 1.8
     assert len(names) + source.arrivals.thinned == source.arrivals.arrived == 120
-    assert source.notes[-1].startswith(f"{120 - len(names)} of 120 images of ")
+    assert source.notes[-1].startswith(f"{120 - len(names)} of 120 frames of ")
 
 
 def test_a_second_reader_gets_the_same_images_at_once_and_then_goes_on(folder):

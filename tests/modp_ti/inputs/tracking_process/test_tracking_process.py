@@ -21,7 +21,7 @@ from modp_ti.files.errors import InputError
 from modp_ti.inputs.klt import open_klt
 from modp_ti.inputs.opening import open_source, open_tracker
 from modp_ti.inputs.sources import FrameReader
-from modp_ti.inputs.sources.frame_store import list_frames
+from modp_ti.inputs.sources.live import list_frames
 from modp_ti.inputs.tracking_process import TrackingProcess
 from tests.modp_ti.inputs.mjpeg_camera import MjpegCamera, encoded
 from tests.modp_ti.inputs.tracking_process.frames import assert_same
