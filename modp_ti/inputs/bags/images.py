@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,8 +35,7 @@ from modp_ti.inputs.sources.video_file import VideoFile
 SAMPLED = 16  # images of 16 bits per channel by which their depth is found
 
 
-@dataclass(frozen=True)
-class _Image:
+class _Image(NamedTuple):
     """An image in the bag: its time [s], and where it is."""
 
     time: float
@@ -89,7 +87,10 @@ class BagImages(ImageSource):
                 self.add_note(f"{left_out} images of {self.topic} have another size than the first: left out")
             if len(images) < len(found):
                 self.add_note(f"{len(found) - len(images)} images of {self.topic} have the time of another: left out")
-            self._bits = self._used_bits() if is_deep(first) else DEPTHS[-1]
+            self._bits = DEPTHS[-1]
+            if is_deep(first):
+                self._bits, deep = used_bits(map(self._deep_values, names[:: max(1, len(names) // SAMPLED)]), path)
+                self._notes += deep
             if calibrated:
                 self.intrinsics = self._camera(settings.camera_info)
         except InputError:
@@ -118,15 +119,8 @@ class BagImages(ImageSource):
         if self._video is not None:
             self._video.close()
 
-    def _used_bits(self) -> int:
-        """Return how many bits the images of 16 bits per channel use, by some of them, with a note."""
-        some = self.names[:: max(1, len(self) // SAMPLED)]
-        bits = used_bits(self._deep_values(self.bag.read(self.topic, self._place[name])) for name in some)
-        if bits < DEPTHS[-1]:
-            self.add_note(f"{self.path}: the images have 16 bits and use {bits}: {(1 << bits) - 1} is taken as white")
-        return bits
-
-    def _deep_values(self, message: Any) -> NDArray:
+    def _deep_values(self, name: str) -> NDArray:
+        message = self.bag.read(self.topic, self._place[name])
         try:
             return stored_values(message, "u2", 3 if message.encoding.startswith(("rgb", "bgr")) else 1)
         except ValueError:  # told when the image is read

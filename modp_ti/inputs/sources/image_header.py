@@ -97,7 +97,7 @@ def read_image_header(file: BinaryIO) -> ImageHeader | None:
     image = None
     try:
         # As a class, which leaves the file at the first coded byte.
-        image = JpegImagePlugin.JpegImageFile(file) if is_jpeg else _opened(file, start)
+        image = JpegImagePlugin.JpegImageFile(file) if is_jpeg else open_image(file)
         complete = _is_complete(file, start)
         tags = image.tag_v2 if isinstance(image, TiffImagePlugin.TiffImageFile) else {}
         size = (TiffImagePlugin.IMAGEWIDTH, TiffImagePlugin.IMAGELENGTH)  # Pillow states that of the upright image
@@ -117,26 +117,27 @@ def read_image_header(file: BinaryIO) -> ImageHeader | None:
         return ImageHeader(0, 0, _is_complete(file, start)) if is_jpeg or is_png or is_heif else None
 
 
-def _opened(file: BinaryIO, start: bytes) -> Image.Image:
-    """Open an image whose file starts with these bytes. Raises `HEADER_ERRORS`, or InputError without its package."""
-    kind = heif_kind(start)
-    return Image.open(file, formats=FORMATS) if kind is None else open_heif(file, kind)
+def open_image(file: BinaryIO) -> Image.Image:
+    """Open an image file with Pillow, without decoding it.
 
-
-def open_heif(file: BinaryIO, kind: str) -> Image.Image:
-    """Open a file of a `heif_kind`. Raises `HEADER_ERRORS`, or InputError if the package that reads it is missing."""
-    if kind == "AVIF":
-        try:
-            from PIL import AvifImagePlugin  # noqa: F401 - whether there is one
-        except ImportError:
-            raise InputError("AVIF photographs need a newer package: pip install 'pillow>=11.3'") from None
-        return Image.open(file, formats=["AVIF"])
+    Raises:
+        InputError: If the package that reads HEIC or AVIF is missing. For other faults, one of `HEADER_ERRORS`.
+    """
+    kind = heif_kind(file.read(64))
+    file.seek(0)
+    if kind is None:
+        return Image.open(file, formats=FORMATS)
     try:
-        from pillow_heif import register_heif_opener
+        if kind == "AVIF":
+            from PIL import AvifImagePlugin  # noqa: F401 - whether there is one
+        else:
+            from pillow_heif import register_heif_opener
+
+            register_heif_opener()
     except ImportError:
-        raise InputError("HEIC photographs need a package: pip install 'modp-ti[heic]'") from None
-    register_heif_opener()
-    return Image.open(file, formats=["HEIF"])
+        package = "'pillow>=11.3'" if kind == "AVIF" else "'modp-ti[heic]'"
+        raise InputError(f"{kind} photographs need a package: pip install {package}") from None
+    return Image.open(file, formats=[kind])
 
 
 def _orientation(image: Image.Image) -> int:
@@ -193,7 +194,7 @@ def why_undecodable(data: bytes) -> str | None:
         InputError: If the package that reads HEIC or AVIF is missing.
     """
     try:
-        with _opened(io.BytesIO(data), data[:64]) as image:
+        with open_image(io.BytesIO(data)) as image:
             width, height = image.size
     except Image.UnidentifiedImageError:
         if data[:4] in TIFF_SIGNATURES:
@@ -203,8 +204,6 @@ def why_undecodable(data: bytes) -> str | None:
         return f"its pixels are more than {MAX_IMAGE_PIXELS:,}"
     except HEADER_ERRORS:
         return "its header is damaged"
-    if width < 1 or height < 1:
-        return f"its header says {width}x{height} pixels"
     if width * height > MAX_IMAGE_PIXELS:
         return f"its {width}x{height} pixels are more than {MAX_IMAGE_PIXELS:,}"
     needed, left = width * height * DECODED_BYTES, available_memory()
@@ -221,9 +220,7 @@ def focal_length_35mm(path: Path) -> float | None:
     """
     try:
         with open_file(path) as file:
-            start = file.read(64)
-            file.seek(0)
-            value = _opened(file, start).getexif().get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.FocalLengthIn35mmFilm)
+            value = open_image(file).getexif().get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.FocalLengthIn35mmFilm)
     except HEADER_ERRORS:
         return None
     return float(value) if isinstance(value, int) and value > 0 else None

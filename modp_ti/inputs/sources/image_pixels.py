@@ -6,6 +6,7 @@ import io
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageCms
 
 from modp_ti.files.terminal import quiet_libraries
-from modp_ti.inputs.sources.image_header import HEADER_ERRORS, ImageHeader, heif_kind, open_heif
+from modp_ti.inputs.sources.image_header import HEADER_ERRORS, ImageHeader, heif_kind, open_image
 from modp_ti.inputs.sources.orientation import turn_of_exif
 from modp_ti.inputs.sources.tone_mapping import ToneMapping, Transfer
 
@@ -35,8 +36,8 @@ def decoded(data: bytes, bits: int = DEPTHS[-1], header: ImageHeader | None = No
     import cv2
 
     profile = b"" if header is None else header.profile
-    if (kind := heif_kind(data[:64])) is not None:
-        image = _decoded_heif(data, kind)
+    if heif_kind(data[:64]) is not None:
+        image = _decoded_heif(data)
         return None if image is None else in_srgb(image, profile)
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     image = decoded_as(data, flags) if bits == DEPTHS[-1] else decoded_deep(data)
@@ -82,14 +83,14 @@ def _as_stored(image: NDArray[Any], header: ImageHeader | None) -> NDArray[Any]:
     return np.ascontiguousarray(turn_of_exif(header.orientation).stored(image))
 
 
-def _decoded_heif(data: bytes, kind: str) -> NDArray[np.uint8] | None:
+def _decoded_heif(data: bytes) -> NDArray[np.uint8] | None:
     """Decode a HEIC or AVIF file to (H, W, 3) uint8 RGB; None if that fails.
 
     HEIC is turned upright, AVIF is not. HDR (PQ or HLG) HEIC is tone-mapped; of other images with more than 8 bits, the
     first 8 are kept.
     """
     try:
-        image = open_heif(io.BytesIO(data), kind)
+        image = open_image(io.BytesIO(data))
         number, bits = (
             image.info.get("nclx_profile", {}).get("transfer_characteristics"),
             image.info.get("bit_depth", 8),
@@ -123,10 +124,15 @@ def quiet_opencv() -> Iterator[None]:
 # ---- 16 bits -----------------------------------------------------------------------------------------------------
 
 
-def used_bits(images: Iterable[NDArray]) -> int:
-    """Return the smallest depth [bits] of a camera that holds all values of the images (uint8 or uint16)."""
+def used_bits(images: Iterable[NDArray], source: Path) -> tuple[int, list[str]]:
+    """Return the smallest depth [bits] of a camera that holds all values of the images (uint8 or uint16).
+
+    With it comes a remark on their source, if they do not use all of 16 bits.
+    """
     largest = max((int(image.max()) for image in images), default=0)
-    return next(bits for bits in DEPTHS if largest < 1 << bits)
+    bits = next(bits for bits in DEPTHS if largest < 1 << bits)
+    note = f"{source}: the images have 16 bits and use {bits}: {(1 << bits) - 1} is taken as white"
+    return bits, [note] if bits < DEPTHS[-1] else []
 
 
 def reduced(image: NDArray, bits: int) -> NDArray[np.uint8]:

@@ -212,9 +212,10 @@ class ListedImages(ImageSource):
                 if image is None or image.dtype != np.uint16:
                     break
                 images.append(image)
-        bits = used_bits(images) if images else DEPTHS[-1]
-        if bits < DEPTHS[-1]:
-            self.add_note(f"{self.path}: the images have 16 bits and use {bits}: {(1 << bits) - 1} is taken as white")
+        if not images:
+            return DEPTHS[-1]
+        bits, notes = used_bits(images, self.path)
+        self._notes += notes
         return bits
 
     @cached_property

@@ -90,6 +90,8 @@ class VideoFile(ImageSource):
                 f"is HDR ({form.transfer.name}, BT.2020): its colours are converted to BT.709, and {PEAK:g} cd/m2 "
                 f"become a white of {WHITE:g} cd/m2 by the curve of BT.2390"
             )
+        if form.interlaced:
+            notes.append("is interlaced: convert it first, for example with `ffmpeg -i in -vf bwdif out.mp4`")
         for note in notes:
             self.add_note(f"{self.path} {note}")
         if not timed:
@@ -169,11 +171,12 @@ class _Form:
     height: int
     turn: Turn
     transfer: Transfer | None  # of HDR video
+    interlaced: bool
 
     @classmethod
     def of(cls, frame: av.VideoFrame) -> _Form:
         transfer = next((each for each in Transfer if each.value == frame.color_trc), None)
-        return cls(frame.width, frame.height, _turn(frame), transfer)
+        return cls(frame.width, frame.height, _turn(frame), transfer, frame.interlaced_frame)
 
 
 def _turn(frame: av.VideoFrame) -> Turn:
