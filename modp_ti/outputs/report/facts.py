@@ -7,6 +7,7 @@ import os
 import platform
 import re
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from fields.runtime.process import available_cores
 from modp_ti.config.keys import as_yaml, documented_values
 from modp_ti.config.settings import SceneConfig
 from modp_ti.files.urls import without_secrets
+from modp_ti.outputs.progress import duration
 from modp_ti.version import __version__
 
 PACKAGES = {"PyTorch": "torch", "NumPy": "numpy", "OpenCV": "opencv-python-headless"}
@@ -51,8 +53,8 @@ OTHERS = {
     "ate_rmse_rigid": ("trajectory error after mapping, with the map's own scale [same units]", ".4g", ""),
     "reprojection_error_tracked": ("tracked points from their pixels, tracker's poses", ".3f", " px"),
     "reprojection_error": ("tracked points from their pixels, poses after mapping", ".3f", " px"),
-    "reprojection_error_anew_tracked": ("points placed anew from their pixels, tracker's poses", ".3f", " px"),
-    "reprojection_error_anew": ("points placed anew from their pixels, poses after mapping", ".3f", " px"),
+    "reprojection_error_anew_tracked": ("points triangulated again, from their pixels, tracker's poses", ".3f", " px"),
+    "reprojection_error_anew": ("points triangulated again, from their pixels, poses after mapping", ".3f", " px"),
 }
 
 
@@ -62,12 +64,8 @@ def changed_settings(config: SceneConfig) -> list[tuple[str, str, str | None]]:
     Returns:
         Dotted key, value as YAML text and default as YAML text of each setting. The default is None if there is none.
     """
-    changes = []
-    for entry, value in documented_values(config):
-        text = "" if value is None else as_yaml(value)
-        if text != entry.default:
-            changes.append((entry.key, text, entry.default))
-    return changes
+    texts = [(entry, "" if value is None else as_yaml(value)) for entry, value in documented_values(config)]
+    return [(entry.key, text, entry.default) for entry, text in texts if text != entry.default]
 
 
 def machine(device: str) -> dict[str, str]:
@@ -78,27 +76,20 @@ def machine(device: str) -> dict[str, str]:
     """
     packages = [str(engine())]
     for name, package in PACKAGES.items():
-        try:
+        with suppress(PackageNotFoundError):  # installed by another distribution package
             packages.append(f"{name} {version(package)}")
-        except PackageNotFoundError:  # installed by another distribution package
-            continue
-    cores = available_cores()
+    cores, text = available_cores(), ""
+    with suppress(OSError):
+        text = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
+    found = re.search(r"^model name\s*:\s*(.+)$", text, re.MULTILINE)
+    processor = found[1].strip() if found else platform.processor() or platform.machine()
     return {
         "MODP-Ti": __version__,
         "backend": device,
-        "processor": f"{_processor()}, {cores} core{'s' if cores > 1 else ''}",
+        "processor": f"{processor}, {cores} core{'s' if cores > 1 else ''}",
         "system": f"{platform.system()} {platform.machine()}, Python {platform.python_version()}",
         "libraries": ", ".join(packages),
     }
-
-
-def _processor() -> str:
-    try:
-        text = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
-    except OSError:
-        text = ""
-    found = re.search(r"^model name\s*:\s*(.+)$", text, re.MULTILINE)
-    return found[1].strip() if found else platform.processor() or platform.machine()
 
 
 def shareable(text: str, *folders: Path) -> str:
@@ -134,12 +125,9 @@ def headline(metrics: Mapping[str, Any]) -> dict[str, str]:
     figures = {f"PSNR, {of}": f"{shown(means['psnr'], '.2f')} dB", f"SSIM, {of}": shown(means["ssim"], ".3f")}
     if means["lpips"] is not None:
         figures[f"LPIPS, {of}"] = shown(means["lpips"], ".3f")
-    return figures | {
-        "Gaussians": f"{metrics['gaussians']:,}",
-        "frames": f"{metrics['frames']:,}",
-        "keyframes": f"{metrics['keyframes']:,}",
-        "time": duration(metrics["seconds"]["total"]),
-    }
+    counts = {"Gaussians": "gaussians", "frames": "frames", "keyframes": "keyframes"}
+    figures |= {label: f"{metrics[name]:,}" for label, name in counts.items()}
+    return figures | {"time": duration(metrics["seconds"]["total"])}
 
 
 def other_figures(metrics: Mapping[str, Any]) -> dict[str, str]:
@@ -155,15 +143,13 @@ def other_figures(metrics: Mapping[str, Any]) -> dict[str, str]:
         figures["corrections from the tracker"] = moved
     if live := metrics.get("live"):
         lag = live["lag_seconds"]
-        figures["lag behind the camera"] = f"{lag['median']:.2f} s, 95 %: {lag['p95']:.2f} s, most: {lag['max']:.2f} s"
-        figures["frames"] = (
-            f"{live['arrived']:,} arrived, {live['tracked']:,} tracked, {live['thinned']:,} left out evenly, "
-            f"{live['lost']:,} lost"
-        )
-        figures["keyframes without work"] = (
-            f"{live['keyframes_skipped']:,} skipped, {live['keyframes_merged']:,} merged"
-        )
-        figures["steps a keyframe"] = f"{live['steps_per_keyframe']:.1f}, and {live['further_steps']:,} between frames"
+        figures |= {
+            "lag behind the camera": f"{lag['median']:.2f} s, 95 %: {lag['p95']:.2f} s, most: {lag['max']:.2f} s",
+            "frames": f"{live['arrived']:,} arrived, {live['tracked']:,} tracked, {live['thinned']:,} left out evenly, "
+            f"{live['lost']:,} lost",
+            "keyframes without work": f"{live['keyframes_skipped']:,} skipped, {live['keyframes_merged']:,} merged",
+            "steps a keyframe": f"{live['steps_per_keyframe']:.1f}, and {live['further_steps']:,} between frames",
+        }
     kept = (metrics.get("retention") or {}).get(last_stage(metrics))
     if kept is not None:
         text = f"{kept['mean']:+.2f} dB in the mean, {kept['worst']:+.2f} dB in the worst 20 in a row"
@@ -174,22 +160,14 @@ def other_figures(metrics: Mapping[str, Any]) -> dict[str, str]:
 def stages(metrics: Mapping[str, Any]) -> list[tuple[str, str, float, float]]:
     """Return name, description, time [s] and share of the total time [%] of each stage that took some."""
     seconds = metrics["seconds"]
-    total = max(seconds["total"], 1e-9)
+    share = 100.0 / max(seconds["total"], 1e-9)
     taken = [(name, meaning, seconds[name]) for name, meaning in STAGES.items() if seconds[name] > 0]
-    return [(*stage, 100.0 * stage[2] / total) for stage in taken]
+    return [(*stage, share * stage[2]) for stage in taken]
 
 
 def shown(value: float | None, form: str) -> str:
     """Format a figure; a dash if it is None or not finite."""
     return "–" if value is None or not math.isfinite(value) else format(value, form)
-
-
-def duration(seconds: float) -> str:
-    """Format a duration for reading, such as "12 min"."""
-    if seconds < 90:
-        return f"{seconds:.0f} s"
-    minutes = round(seconds / 60)
-    return f"{minutes} min" if minutes < 90 else f"{minutes // 60} h {minutes % 60} min"
 
 
 def good_figures(metrics: Mapping[str, Any]) -> list[str]:
@@ -201,7 +179,6 @@ def good_figures(metrics: Mapping[str, Any]) -> list[str]:
 def remarks(metrics: Mapping[str, Any], notes: Iterable[str]) -> list[str]:
     """Return the run's notes, with a warning if no frame was held out."""
     said = list(notes)
-    scores = metrics[last_stage(metrics)]
-    if not scores["held_out"]["count"]:
+    if not metrics[last_stage(metrics)]["held_out"]["count"]:
         said.append("no frame was held out: the scores are of frames that the map was made of, and flatter it")
     return said

@@ -20,7 +20,6 @@ from modp_ti.files.errors import InputError
 from modp_ti.outputs.evaluation import FrameScore, MapVersion, umeyama
 from modp_ti.outputs.playback.map_renderer import eight_bits
 from modp_ti.outputs.report import facts, plots
-from modp_ti.outputs.report.plots import floor_plan, plan_of
 from modp_ti.outputs.report.record import RunRecord
 
 # Error at which the colour scale ends.
@@ -98,9 +97,16 @@ class Album:
         held_out = [score for score in scores if score.held_out]
         comparisons = []
         for score, rank in picked(held_out or [score for score in scores if score.index in self.kept]):
-            image, render = self.kept.get(score.index) or _read_pair(renders / f"{score.index:06d}.png")
-            error = error_colours(error_map(image, render))
-            comparisons.append(Comparison(score, rank, data_uri(image), data_uri(render), data_uri(error)))
+            if score.index in self.kept:
+                image, render = self.kept[score.index]
+            else:  # side by side
+                path = renders / f"{score.index:06d}.png"
+                pair = cv2.imread(str(path), cv2.IMREAD_COLOR_RGB)
+                if pair is None:
+                    raise InputError(f"{path}: the picture is missing or damaged; run again to write it")
+                image, render = np.hsplit(np.asarray(pair, dtype=np.uint8), 2)
+            error = np.abs(image.astype(np.float32) - render.astype(np.float32)).mean(axis=2) / 255.0
+            comparisons.append(Comparison(score, rank, *map(_jpeg, (image, render, error_colours(error)))))
         return comparisons
 
 
@@ -121,42 +127,24 @@ def picked(scores: Sequence[FrameScore]) -> list[tuple[FrameScore, str]]:
     return [(order[place], words.get(place, "")) for place in sorted(set(places))]
 
 
-def error_map(image: NDArray[np.uint8], render: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Return the mean absolute difference (H, W) of two pictures (H, W, 3), scaled to [0, 1]."""
-    return (np.abs(image.astype(np.float32) - render.astype(np.float32)).mean(axis=2) / 255.0).astype(np.float32)
-
-
-def error_colours(error: NDArray[np.float32]) -> NDArray[np.uint8]:
+def error_colours(error: NDArray[np.floating]) -> NDArray[np.uint8]:
     """Map errors (H, W) to RGB colours (H, W, 3), from black for 0 to pale yellow for FULL_SCALE and more."""
-    steps = np.round(np.clip(error / FULL_SCALE, 0.0, 1.0) * 255.0).astype(np.uint8)
-    return np.asarray(cv2.applyColorMap(steps, cv2.COLORMAP_INFERNO), dtype=np.uint8)[..., ::-1]
+    return np.asarray(cv2.applyColorMap(eight_bits(error / FULL_SCALE), cv2.COLORMAP_INFERNO), np.uint8)[..., ::-1]
 
 
-def data_uri(picture: NDArray[np.uint8], longest: int = LONGEST) -> str:
-    """Encode a picture (H, W, 3) RGB as a JPEG data URI, scaled down to sides of at most `longest` pixels."""
+def _jpeg(picture: NDArray[np.uint8]) -> str:
+    """Encode a picture (H, W, 3) RGB as a JPEG data URI, scaled down to sides of at most LONGEST pixels."""
     height, width = picture.shape[:2]
-    factor = min(1.0, longest / max(height, width))
+    factor = LONGEST / max(height, width)
     if factor < 1.0:
         size = (max(1, round(width * factor)), max(1, round(height * factor)))
         picture = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
     options = [cv2.IMWRITE_JPEG_QUALITY, QUALITY]
-    _, data = cv2.imencode(".jpg", np.ascontiguousarray(picture[..., ::-1]), options)
-    return as_uri("jpeg", data.tobytes())
+    return _uri("jpeg", cv2.imencode(".jpg", np.ascontiguousarray(picture[..., ::-1]), options)[1].tobytes())
 
 
-def as_uri(kind: str, data: bytes) -> str:
-    """Return an image file of this kind as a data URI."""
+def _uri(kind: str, data: bytes) -> str:
     return f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"
-
-
-def _read_pair(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Split a side-by-side picture into frame and render."""
-    pair = cv2.imread(str(path))
-    if pair is None:
-        raise InputError(f"{path}: the picture is missing or damaged; run again to write it")
-    pair = np.asarray(pair, dtype=np.uint8)[..., ::-1]
-    half = pair.shape[1] // 2
-    return pair[:, :half], pair[:, half:]
 
 
 @dataclass(frozen=True)
@@ -199,6 +187,7 @@ def write_report(path: Path, run: ReportedRun) -> None:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    strip = error_colours(np.linspace(0.0, FULL_SCALE, 128)[None])[..., ::-1]
     page = environment.get_template("page.html.j2").render(
         run=run,
         facts=facts,
@@ -208,8 +197,8 @@ def write_report(path: Path, run: ReportedRun) -> None:
         stage=facts.last_stage(run.metrics),
         maps=[stage for stage in ("online", "refined", "offline") if run.metrics[stage] is not None],
         remarks=facts.remarks(run.metrics, run.record.notes),
-        drawings={name: as_uri("svg+xml", svg.encode("utf-8")) for name, svg in _drawings(run).items()},
-        scale=_scale(),
+        drawings={name: _uri("svg+xml", svg.encode("utf-8")) for name, svg in _drawings(run).items()},
+        scale=_uri("png", cv2.imencode(".png", np.ascontiguousarray(strip))[1].tobytes()),
         full_scale=FULL_SCALE,
         map_page=MAP_PAGE,
     )
@@ -221,47 +210,29 @@ def write_report(path: Path, run: ReportedRun) -> None:
 def show_link_to_map(path: Path) -> None:
     """Show the link to `map.html` in a report that was written before it. Does nothing without a report."""
     if path.is_file():
-        page = path.read_text("utf-8")
-        if HIDDEN_LINK in page:
-            replace_text(path, page.replace(HIDDEN_LINK, SHOWN_LINK))
+        replace_text(path, path.read_text("utf-8").replace(HIDDEN_LINK, SHOWN_LINK))
 
 
 def _drawings(run: ReportedRun) -> dict[str, str]:
     """Return the SVG of every drawing that the run has data for."""
     last = list(run.versions.values())[-1]
-    plan = plan_of(last.trajectory)
-    floor = floor_plan(plan, last.gaussians, camera_centres(last.trajectory))
-    drawings = {}
-    if run.scores or any(note.mapped_psnr is not None for note in run.record.frames):
-        drawings["psnr"] = plots.psnr_of_frames(run.scores, run.record.frames)
-    if run.record.frames and run.config.mode == "online":
-        drawings["growth"] = plots.growth(run.record.frames)
-    if any(note.lag is not None for note in run.record.frames):
-        drawings["pace"] = plots.pace(run.record.frames)
-    if run.record.steps:
-        drawings["steps"] = plots.steps(run.record.steps)
-    truth = _aligned(run.truth, last.trajectory)
-    drawings["trajectory"] = plots.trajectory(plan, run.tracked, last.trajectory, run.keyframes, floor, truth)
-    if run.config.mode == "online":
-        ways = {name: version.trajectory for name, version in run.versions.items()}
-        drawings["poses"] = plots.pose_changes(run.tracked, ways, run.scene_depth)
-    return drawings
-
-
-def _aligned(
-    truth: Sequence[NDArray[np.float64]], estimate: Sequence[NDArray[np.float64]]
-) -> NDArray[np.float64] | None:
-    """Align the true camera centres (N, 3) to the estimate by the best similarity. None without ground truth."""
-    if len(truth) != len(estimate) or len(truth) < 3:
-        return None
-    there = camera_centres(truth)
-    known = np.isfinite(there).all(axis=1)
-    s, R, t = umeyama(there[known], camera_centres(estimate)[known])
-    return s * there @ R.T + t
-
-
-def _scale() -> str:
-    """Return the colour scale of the error maps, from 0 to FULL_SCALE, as a data URI."""
-    strip = error_colours(np.linspace(0.0, FULL_SCALE, 128, dtype=np.float32)[None])
-    _, data = cv2.imencode(".png", np.ascontiguousarray(strip[..., ::-1]))
-    return as_uri("png", data.tobytes())
+    centres, frames, online = camera_centres(last.trajectory), run.record.frames, run.config.mode == "online"
+    plan = plots.plan_of(last.trajectory)
+    floor = plots.floor_plan(plan, last.gaussians, centres)
+    truth = None
+    if len(run.truth) == len(centres) >= 3:
+        true = camera_centres(run.truth)
+        known = np.isfinite(true).all(axis=1)
+        s, R, t = umeyama(true[known], centres[known])
+        truth = s * true @ R.T + t
+    ways = {name: version.trajectory for name, version in run.versions.items()}
+    has_psnr = bool(run.scores) or any(note.mapped_psnr is not None for note in frames)
+    drawn = {
+        "psnr": has_psnr and (plots.psnr_of_frames, run.scores, frames),
+        "growth": bool(frames) and online and (plots.growth, frames),
+        "pace": any(note.lag is not None for note in frames) and (plots.pace, frames),
+        "steps": bool(run.record.steps) and (plots.steps, run.record.steps),
+        "trajectory": (plots.trajectory, plan, run.tracked, last.trajectory, run.keyframes, floor, truth),
+        "poses": online and (plots.pose_changes, run.tracked, ways, run.scene_depth),
+    }
+    return {name: plots.svg(*drawing) for name, drawing in drawn.items() if drawing}

@@ -5,15 +5,11 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from modp_ti.outputs.evaluation import FrameScore, keyframe_psnr
 from pipelines.pipeline import FrameReport, Pipeline
-
-if TYPE_CHECKING:
-    from pipelines.pipeline import FrameReport
 
 # Keyframes in a row over which the worst change is averaged.
 WINDOW = 20
@@ -141,15 +137,13 @@ def retention(frames: Sequence[FrameNote], scores: Sequence[FrameScore]) -> dict
         whose PSNR was measured.
     """
     mapped = {note.index: note.mapped_psnr for note in frames if note.mapped_psnr is not None}
-    if not mapped:
-        return None
     result: dict[str, Mapping[str, float]] = {}
     for stage in dict.fromkeys(score.stage for score in scores):
         final = {score.index: score.psnr for score in scores if score.stage == stage}
         change = np.array([final[index] - psnr for index, psnr in mapped.items() if index in final])
-        if not len(change):  # no keyframe could be read again
+        if not len(change):  # none was measured, or none could be read again
             return None
         width = min(WINDOW, len(change))
         window = np.convolve(change, np.full(width, 1.0 / width), mode="valid")
         result[stage] = {"mean": round(float(change.mean()), 4), "worst": round(float(window.min()), 4)}
-    return result
+    return result if mapped else None

@@ -17,7 +17,7 @@ from modp_ti.outputs.formats.run_files import read_exposures
 from modp_ti.outputs.playback.finished_run import FinishedRun
 from modp_ti.outputs.playback.map_renderer import MapRenderer, eight_bits, start_device
 from modp_ti.outputs.playback.run_frames import kept_images, pictures
-from modp_ti.outputs.viewer.handover import BrowserCamera, Latest
+from modp_ti.outputs.viewer.handover import BrowserCamera
 from modp_ti.outputs.viewer.modes import MODES, SPLATS, Photograph, painter, pinhole_of, splats_of
 from modp_ti.outputs.viewer.page import Page, ShownFrame
 from pipelines.whole.hierarchy import Hierarchy
@@ -48,7 +48,7 @@ class FinishedViewer:
     def __init__(self, run: FinishedRun, settings: ViewSettings, device: str) -> None:
         self.run = run
         self._max_splats = settings.max_splats
-        self._chosen: Latest[dict[int, int]] = Latest(lambda newer, waiting: waiting | newer)
+        self._chosen: dict[int, int] = {}  # the frames that browsers wait for
         gaussians, points = run.gaussians, _tracked_points(run)
         self._kept = kept_images(run) is not None
         self._exposures = read_exposures(run.folder / "exposure.json") if self._kept else {}
@@ -79,12 +79,13 @@ class FinishedViewer:
 
     def choose(self, client: int, index: int) -> None:
         """Show a frame to a browser, which `serve` does."""
-        self._chosen.put({client: index})
+        self._chosen[client] = index
 
     def serve(self, done: Callable[[], bool] = lambda: False) -> None:
         """Render what browsers request, until `done` returns true."""
         while not done():
-            for client, index in (self._chosen.take(timeout=0.0) or {}).items():
+            while self._chosen:
+                client, index = self._chosen.popitem()
                 self.page.attempt(client, partial(self._show_frame, index, client))
             camera = self.page.requests.next(timeout=0.1)
             if camera is not None:

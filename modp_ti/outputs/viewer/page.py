@@ -1,9 +1,9 @@
-"""The web page that viser serves: its scene and its controls."""
+"""The web page that viser serves: its scene, its controls, and what each browser shows of them."""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import camera_centres, inverse_se3, quaternion_from_matrix
 from modp_ti.files.errors import InputError
-from modp_ti.outputs.viewer.browser import FRAME, KEYFRAMES, POINTS, SPLATS_NODE, Browser
-from modp_ti.outputs.viewer.handover import Gate, Requests
-from modp_ti.outputs.viewer.modes import MODES, SPLATS, Splats
+from modp_ti.outputs.viewer.handover import BrowserCamera, Gate, Requests
+from modp_ti.outputs.viewer.modes import MODES, SPLATS, Splats, scale_of
 
 if TYPE_CHECKING:
     import viser
@@ -26,9 +25,12 @@ DEPTH_ON_PAGE = 4.0
 # Depth of the frustums of keyframes and of the current frame, and size of points [page units].
 KEYFRAME_SIZE, FRAME_SIZE, POINT_SIZE = 0.12, 0.4, 0.006
 KEYFRAME_COLOUR, FRAME_COLOUR, POINT_COLOUR = (90, 140, 255), (255, 120, 30), (255, 60, 60)
-JPEG_QUALITY = 85
+JPEG = {"format": "jpeg", "jpeg_quality": 85}
 # Corners of a frustum's image as (x, y) in {0, 1}.
 CORNERS = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+# Names of the nodes of the scene, and the labels of the boxes of those that can be hidden.
+KEYFRAMES, FRAME, POINTS, SPLATS_NODE = "/keyframes", "/frame", "/points", "/splats"
+LABELS = {KEYFRAMES: "Keyframes", FRAME: "Current frame", POINTS: "Tracked points"}
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,79 @@ class ShownFrame:
     T_camera_world: NDArray[np.float64]
     camera: PinholeCamera
     picture: NDArray[np.uint8] | None
+
+
+class Browser:
+    """A connected browser, with its own mode, frame, boxes and camera.
+
+    Args:
+        client: viser's handle of the browser.
+        modes: Display modes to choose from. The first one is shown first.
+        frames: Number of frames to choose from; 0 for no choice.
+
+    Attributes:
+        nodes: The nodes of this browser alone, by name.
+        chosen: The frame that this browser has chosen; None while it shows that of all browsers.
+    """
+
+    def __init__(self, client: viser.ClientHandle, modes: Sequence[str], frames: int) -> None:
+        gui = client.gui
+        self.client = client
+        self.slider = gui.add_slider("Frame", 0, max(frames - 1, 1), 1, 0) if frames else None
+        self.mode = gui.add_dropdown("Show", tuple(modes), hint="splats: drawn by the browser; others: by our renderer")
+        self._scale = gui.add_html("", visible=False)
+        self._note = gui.add_markdown("")
+        self.boxes = {name: gui.add_checkbox(label, initial_value=True) for name, label in LABELS.items()}
+        self.look = gui.add_button("Look from the current frame")
+        self.link = gui.add_button("Link to this view")
+        self.nodes: dict[str, Any] = {}
+        self.chosen: ShownFrame | None = None
+        self._veils: dict[str, Any] = {}  # empty nodes that hide those of all browsers from this one
+
+    @property
+    def controls(self) -> list[Any]:
+        """The controls that the browser may change."""
+        return [self.mode, *self.boxes.values(), self.look, self.link, *([self.slider] if self.slider else [])]
+
+    @property
+    def camera(self) -> BrowserCamera:
+        """Where the browser looks from."""
+        c = self.client.camera
+        mode = self.mode.value
+        return BrowserCamera(self.client.client_id, c.wxyz, c.position, c.fov, c.image_width, c.image_height, mode)
+
+    @property
+    def link_to_view(self) -> str:
+        """The query of the page's address that opens it with this browser's camera."""
+        c = self.client.camera
+        parts = {"Position": c.position, "LookAt": c.look_at, "Up": c.up_direction, "Fov": [c.fov]}
+        return "?" + "&".join(f"initialCamera{k}={','.join(f'{x:.4g}' for x in part)}" for k, part in parts.items())
+
+    def note(self, text: str) -> None:
+        """Show Markdown text below the mode."""
+        if text != self._note.content:
+            self._note.content = text
+
+    def scale(self, depth: float | None) -> None:
+        """Show what the colours of the mode mean, given the depth of the scene [scene units]."""
+        content = "" if depth is None else scale_of(self.mode.value, depth)
+        if content != self._scale.content:
+            self._scale.content, self._scale.visible = content, bool(content)
+
+    def arrange(self, frame: ShownFrame | None, units: float) -> None:
+        """Hide what this browser does not want to see, and the frame's picture while one looks from inside of it."""
+        hidden = {name: not box.value for name, box in self.boxes.items()} | {SPLATS_NODE: self.mode.value != SPLATS}
+        if frame is not None:
+            inside = inverse_se3(frame.T_camera_world)[:3, 3] * units
+            hidden[FRAME] |= float(np.linalg.norm(self.client.camera.position - inside)) < FRAME_SIZE
+        for name, hide in hidden.items():
+            if (own := self.nodes.get(name)) is not None:
+                if own.visible == hide:
+                    own.visible = not hide
+            elif hide and name not in self._veils:
+                self._veils[name] = self.client.scene.add_frame(name, show_axes=False)
+            elif not hide and name in self._veils:
+                self._veils.pop(name).remove()
 
 
 class Page:
@@ -88,8 +163,7 @@ class Page:
         self._gate = gate
         self._modes, self._choose, self._frames = modes, choose, frames
         self._units: float | None = None
-        self._frame: ShownFrame | None = None
-        self._chosen: dict[int, ShownFrame] = {}  # by browser, where each chooses its own
+        self._frame: ShownFrame | None = None  # of the browsers that have chosen none
         self._nodes: dict[str, Any] = {}  # those of all browsers
         self._browsers: dict[int, Browser] = {}
         self._eyes = np.zeros((0, 3))  # of the keyframes [page units]
@@ -143,10 +217,9 @@ class Page:
         if self._units is not None:
             return
         self._units = DEPTH_ON_PAGE / scene_depth
-        first, up = self._server.initial_camera, -T_camera_world[1, :3]
-        self._server.scene.set_up_direction(up)
-        first.position, first.look_at = self._eye_and_target(T_camera_world)
-        first.up, first.fov = up, _vertical(camera)
+        self._server.scene.set_up_direction(-T_camera_world[1, :3])
+        first = self._server.initial_camera
+        first.position, first.look_at, first.up, first.fov = self._view(T_camera_world, camera)
         for browser in list(self._browsers.values()):
             self._look(browser.client, T_camera_world, camera)
             browser.scale(scene_depth)
@@ -157,46 +230,37 @@ class Page:
 
     def show_splats(self, splats: Splats, client: int | None = None) -> None:
         """Replace the splats of one browser, or of all, which are visible in the splats mode."""
-        values = splats.centres, splats.covariances, splats.colours, splats.opacities
         drawn = "" if len(splats.centres) == splats.of else f"{len(splats.centres):,} of {splats.of:,} Gaussians drawn"
+        values = splats.centres, splats.covariances, splats.colours, splats.opacities
         with self._lock:
             self._drawn = drawn if client is None else self._drawn
-            browsers = [browser for key, browser in self._browsers.items() if client in (None, key)]
-            for browser in browsers:
+            for browser in self._shown_to(client):
                 browser.note(drawn)
-            nodes, scene = self._scene_of(client)
-            if scene is not None and SPLATS_NODE in nodes:
-                nodes[SPLATS_NODE].set_gaussians(*values)
-            elif scene is not None:
-                nodes[SPLATS_NODE] = scene.add_gaussian_splats(SPLATS_NODE, *values)
-                self._arrange(browsers)
+            self._put(
+                SPLATS_NODE,
+                client,
+                lambda scene: scene.add_gaussian_splats(SPLATS_NODE, *values),
+                lambda node: node.set_gaussians(*values),
+            )
 
     def show_picture(self, client: int, picture: NDArray[np.uint8]) -> None:
         """Set a picture (H, W, 3) as the background of one browser."""
         with self._lock:
             browser = self._browsers.get(client)
             if browser is not None and browser.mode.value != SPLATS:
-                browser.client.scene.set_background_image(picture, format="jpeg", jpeg_quality=JPEG_QUALITY)
+                browser.client.scene.set_background_image(picture, **JPEG)
 
     def show_frame(self, frame: ShownFrame, client: int | None = None) -> None:
         """Show the current frame of one browser, or of all, as a frustum with its image."""
         T_world_camera = inverse_se3(frame.T_camera_world)
         if client is None:
             self._frame = frame
-        else:
-            self._chosen[client] = frame
-        style = {
-            "fov": _vertical(frame.camera),
-            "aspect": frame.camera.width / frame.camera.height,
-            "scale": FRAME_SIZE,
-            "thickness": 2.0,
-            "thickness_units": "screen",
-            "color": FRAME_COLOUR,
-            "format": "jpeg",
-            "jpeg_quality": JPEG_QUALITY,
-        }
+        elif client in self._browsers:
+            self._browsers[client].chosen = frame
+        style = {"scale": FRAME_SIZE, "thickness": 2.0, "thickness_units": "screen", "color": FRAME_COLOUR, **JPEG}
+        shape = {"fov": _vertical(frame.camera), "aspect": frame.camera.width / frame.camera.height}
         self._show(
-            lambda scene, **values: scene.add_camera_frustum(FRAME, **style, **values),
+            lambda scene, **values: scene.add_camera_frustum(FRAME, **style, **shape, **values),
             FRAME,
             client,
             image=frame.picture,
@@ -221,27 +285,29 @@ class Page:
 
     def _show(self, add: Callable[..., Any], name: str, client: int | None = None, **values: Any) -> None:
         """Set the values of a node of one browser, or of all, which `add` creates first where there is none."""
+
+        def change(node: Any) -> None:
+            for attribute, value in values.items():
+                setattr(node, attribute, value)
+
+        self._put(name, client, lambda scene: add(scene, **values), change)
+
+    def _put(self, name: str, client: int | None, add: Callable[[Any], Any], change: Callable[[Any], None]) -> None:
+        """Add a node of one browser, or of all, or change it. A browser that has left gets none."""
         with self._lock:
-            nodes, scene = self._scene_of(client)
-            if scene is not None and name not in nodes:
-                nodes[name] = add(scene, **values)
-            elif scene is not None:
-                for attribute, value in values.items():
-                    setattr(nodes[name], attribute, value)
-            self._arrange([browser for key, browser in self._browsers.items() if client in (None, key)])
+            browser = None if client is None else self._browsers.get(client)
+            if client is not None and browser is None:
+                return
+            nodes = self._nodes if browser is None else browser.nodes
+            if name in nodes:
+                change(nodes[name])
+            else:
+                nodes[name] = add(self._server.scene if browser is None else browser.client.scene)
+            for shown_to in self._shown_to(client):
+                shown_to.arrange(shown_to.chosen or self._frame, self.units)
 
-    def _scene_of(self, client: int | None) -> tuple[dict[str, Any], Any]:
-        """Return the nodes and the scene of one browser, or of all; the scene is None if the browser has left."""
-        if client is None:
-            return self._nodes, self._server.scene
-        browser = self._browsers.get(client)
-        return ({}, None) if browser is None else (browser.nodes, browser.client.scene)
-
-    def _arrange(self, browsers: Iterable[Browser]) -> None:
-        for browser in browsers:
-            frame = self._chosen.get(browser.client.client_id, self._frame)
-            centre = None if frame is None else inverse_se3(frame.T_camera_world)[:3, 3] * self.units
-            browser.arrange(centre, FRAME_SIZE)
+    def _shown_to(self, client: int | None) -> list[Browser]:
+        return [browser for number, browser in self._browsers.items() if client in (None, number)]
 
     # ---- controls --------------------------------------------------------------------------------------------
 
@@ -274,13 +340,13 @@ class Page:
         with self._lock:
             self._browsers[number] = browser
             browser.note(self._drawn)
-        if (choose := self._choose) is not None and (slider := browser.frame) is not None:
+        if (choose := self._choose) is not None and (slider := browser.slider) is not None:
             on(slider.on_update, lambda: choose(number, min(int(slider.value), self._frames - 1)))
             choose(number, 0)
         on(browser.mode.on_update, lambda: self._set_mode(browser))
         for box in browser.boxes.values():
             on(box.on_update, lambda: self._moved(browser))
-        on(browser.look.on_click, lambda: self._look_from_frame(client))
+        on(browser.look.on_click, lambda: self._look_from_frame(browser))
         on(browser.link.on_click, lambda: browser.note(f"[This view]({self.url}{browser.link_to_view})"))
         on(client.camera.on_update, lambda: self._moved(browser))
         self._door.admit(*browser.controls)
@@ -290,7 +356,6 @@ class Page:
         self.requests.leave(client.client_id)
         with self._lock:
             self._browsers.pop(client.client_id, None)
-            self._chosen.pop(client.client_id, None)
 
     def _set_mode(self, browser: Browser) -> None:
         with self._lock:
@@ -304,36 +369,33 @@ class Page:
         with self._lock:
             if browser.client.client_id not in self._server.get_clients():
                 return  # late message of a disconnected browser
-            self._arrange([browser])
+            browser.arrange(browser.chosen or self._frame, self.units)
             self.requests.look(browser.camera)
         if self._gate is not None:
             self._gate.wake()
 
-    def _look_from_frame(self, client: viser.ClientHandle) -> None:
-        frame = self._chosen.get(client.client_id, self._frame)
-        if frame is not None:
-            self._look(client, frame.T_camera_world, frame.camera)
+    def _look_from_frame(self, browser: Browser) -> None:
+        if (frame := browser.chosen or self._frame) is not None:
+            self._look(browser.client, frame.T_camera_world, frame.camera)
 
     def _look(self, client: viser.ClientHandle, T_camera_world: NDArray[np.float64], camera: PinholeCamera) -> None:
         """Move a browser's camera to a camera's place."""
         with client.atomic():
-            client.camera.fov = _vertical(camera)
-            client.camera.position, client.camera.look_at = self._eye_and_target(T_camera_world)
-            client.camera.up_direction = -T_camera_world[1, :3]
+            to = client.camera
+            to.position, to.look_at, to.up_direction, to.fov = self._view(T_camera_world, camera)
 
-    def _eye_and_target(self, T_camera_world: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return centre and target of a camera with this pose (4, 4) [page units]."""
+    def _view(self, T_camera_world: NDArray[np.float64], camera: PinholeCamera) -> tuple[Any, Any, Any, float]:
+        """Return centre and target [page units], up direction and vertical field of view [rad] of a camera."""
         eye = inverse_se3(T_camera_world)[:3, 3] * self.units
-        return eye, eye + DEPTH_ON_PAGE * T_camera_world[2, :3]
+        return eye, eye + DEPTH_ON_PAGE * T_camera_world[2, :3], -T_camera_world[1, :3], _vertical(camera)
 
 
 def frustum_lines(poses: NDArray[np.float64], camera: PinholeCamera, units: float) -> NDArray[np.float32]:
     """Return the edges (8 N, 2, 3) of camera frustums in page units, for T_camera_world (N, 4, 4)."""
     size = np.array([camera.width, camera.height])
     corners = camera.unproject(CORNERS * size, np.full(4, KEYFRAME_SIZE))
-    R = poses[:, :3, :3]
     centres = camera_centres(poses) * units
-    ends = centres[:, None] + np.einsum("nji,kj->nki", R, corners)
+    ends = centres[:, None] + np.einsum("nji,kj->nki", poses[:, :3, :3], corners)
     sides = np.stack([np.broadcast_to(centres[:, None], ends.shape), ends], axis=2)
     around = np.stack([ends, np.roll(ends, -1, axis=1)], axis=2)
     return np.concatenate([sides, around], axis=1).reshape(-1, 2, 3).astype(np.float32)

@@ -32,7 +32,7 @@ def address(tmp_path_factory) -> str:
 
 
 @pytest.fixture(scope="module")
-def chromium() -> Iterator:
+def window() -> Iterator:
     from playwright.sync_api import sync_playwright
 
     executable = next(path for path in map(shutil.which, chromium.NAMES) if path)
@@ -49,9 +49,9 @@ def luminance(colour: list[float]) -> float:
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("width", [320, 390, 1000, 1280])
-def test_the_page_fits_its_window_and_is_legible(chromium, address: str, width: int, scheme: str) -> None:
-    context = chromium.new_context(viewport={"width": width, "height": 844}, is_mobile=width < 500, color_scheme=scheme)
+@pytest.mark.parametrize("width", [320, 1000])
+def test_the_page_fits_its_window_and_is_legible(window, address: str, width: int, scheme: str) -> None:
+    context = window.new_context(viewport={"width": width, "height": 844}, is_mobile=width < 500, color_scheme=scheme)
     page = context.new_page()
     page.goto(address)
     assert page.evaluate("document.documentElement.scrollWidth") <= width

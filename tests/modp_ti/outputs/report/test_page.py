@@ -95,11 +95,10 @@ def test_the_stages_are_those_of_the_metrics_and_their_bars_as_long(made) -> Non
     rows = {row[0]: row[1:] for row in page.tables["time"]}
     seconds = run.metrics["seconds"]
     assert {name for name in rows if name != "total"} == {k for k, v in seconds.items() if v > 0 and k != "total"}
-    for name, row in rows.items():
-        assert row[1] == f"{seconds[name]:.1f} s"
-    widths = [float(w) for w in re.findall(r'<i style="width: ([0-9.]+)%">', html)]
-    assert sum(widths) == pytest.approx(100, abs=0.1)
-    assert f"{100 * seconds['optimise'] / seconds['total']:.2f}" in re.findall(r"width: ([0-9.]+)%", html)
+    assert all(row[1] == f"{seconds[name]:.1f} s" for name, row in rows.items())
+    widths = re.findall(r'<i style="width: ([0-9.]+)%">', html)
+    assert sum(map(float, widths)) == pytest.approx(100, abs=0.1)
+    assert f"{100 * seconds['optimise'] / seconds['total']:.2f}" in widths
 
 
 def test_the_curves_are_the_recorded_numbers(made) -> None:
@@ -223,25 +222,17 @@ def test_a_run_without_scores_and_one_with_gaps_have_their_pages(tmp_path, recwa
 @pytest.mark.parametrize(
     ("changes", "there", "missing"),
     [
-        ({"mode": "offline"}, ["Offline optimisation"], ["Post refinement", "While the frames came"]),
-        ({"refine": 0}, ["While the frames came"], ["Post refinement"]),
-        ({"holdout": 0}, ["The map was made of these frames: none was held out."], ["held-out frame"]),
-        ({"frames": 2, "holdout": 2, "refine": 1}, ["From above"], []),
-        ({"frames": 1, "holdout": 0, "refine": 0, "truth": False}, ["From above"], ["trajectory error"]),
-        ({"frames": 40, "keyframe_every": 10**6}, ["While the frames came"], []),
+        ({"mode": "offline"}, {"step-psnr", "step-gaussians"}, {"gaussians", "shift-online"}),
+        ({"holdout": 0, "refine": 0}, {"gaussians"}, {"step-psnr"}),
+        ({"frames": 1, "holdout": 0, "refine": 0, "truth": False}, {"way-after"}, {"way-truth"}),
+        ({"frames": 300, "holdout": 15, "refine": 5000, "size": (480, 640)}, {"step-psnr"}, set()),
     ],
 )
-def test_every_kind_of_run_has_its_page(tmp_path, changes, there, missing, recwarn, caplog) -> None:
-    page, _ = written(tmp_path, made_up_run(tmp_path, **changes))
-    text = "\n".join(page.text)
-    assert not [line for line in there if line not in text]
-    assert not [line for line in missing if line.lower() in text.lower().replace("held-out frames\n", "")]
+def test_every_kind_of_run_has_its_page_of_limited_size(tmp_path, changes, there, missing, recwarn, caplog) -> None:
+    page, html = written(tmp_path, made_up_run(tmp_path, **changes))
+    curves = set(page.curves())
+    assert there <= curves and not missing & curves
     assert not [str(w.message) for w in recwarn] + caplog.messages, "drawing warns of nothing"
-
-
-def test_a_long_run_of_large_pictures_stays_small(tmp_path) -> None:
-    run = made_up_run(tmp_path, frames=300, holdout=15, refine=5000, size=(480, 640))
-    _, html = written(tmp_path, run)
     assert len(html) < 3_000_000
 
 

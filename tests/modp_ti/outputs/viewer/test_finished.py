@@ -165,17 +165,10 @@ def test_an_image_that_is_gone_ends_nothing(run: FinishedRun):
         viewer.close()
 
 
-def test_what_is_wrong_is_said_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    result = CliRunner().invoke(app, ["view", str(tmp_path / "nowhere")])
-    assert result.exit_code == 2
-    assert result.stderr.startswith("error: ") and result.stderr.count("\n") == 1
-
-
 def test_without_viser_a_run_ends_before_it_begins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     (tmp_path / "scene.yaml").write_text("source: {path: images}\ntracker: {kind: colmap}\noutput: out\n")
     result = CliRunner().invoke(app, ["run", str(tmp_path / "scene.yaml"), "--view"])
-    assert result.exit_code == 2
-    assert result.stderr.startswith('error: the viewer needs viser: pip install "modp-ti[viewer]"')
-    assert result.stderr.count("\n") == 1 and result.stdout == ""
+    assert (result.exit_code, result.stderr.count("\n"), result.stdout) == (2, 1, "")
+    assert 'pip install "modp-ti[viewer]"' in result.stderr
     assert not (tmp_path / "out").exists()

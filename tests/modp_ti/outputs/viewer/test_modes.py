@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from fields.geometry.camera import PinholeCamera
 from modp_ti.outputs.viewer.handover import BrowserCamera
-from modp_ti.outputs.viewer.modes import Photograph, image_error, nearest_photograph, picture_of, pinhole_of, splats_of
+from modp_ti.outputs.viewer.modes import Photograph, image_error, nearest_photograph, pinhole_of, splats_of
 from pipelines.render.renderer import RenderedView
 
 WALL = 4.0  # the plane z = 4 of the world, coloured by where it is
@@ -147,13 +147,6 @@ def test_the_nearest_photograph_looks_at_the_same_things():
     assert nearest_photograph(poses, pose(0.1), WALL) == 2
 
 
-def test_pictures_are_of_eight_bits():
-    view = RenderedView(np.float32([[[-1.0, 0.5, 2.0]]]), np.float32([[2.0]]), np.float32([[0.5]]))
-    np.testing.assert_array_equal(picture_of(view, "colour", 1.0), [[[0, 128, 255]]])
-    np.testing.assert_array_equal(picture_of(view, "opacity", 1.0), [[[128, 128, 128]]])
-    assert picture_of(view, "depth", 1.0).shape == (1, 1, 3)
-
-
 def some(count: int) -> dict[str, np.ndarray]:
     rng = np.random.default_rng(4)
     return {
@@ -188,8 +181,3 @@ def test_of_a_large_map_a_subsample_is_drawn_that_covers_as_much():
     areas = [np.prod(np.linalg.eigvalsh(c)) ** (1 / 3) for c in splats.covariances]
     expected = 4 * np.exp(2 * state["log_scale"][::4].mean(axis=1))
     np.testing.assert_allclose(areas, expected, rtol=1e-3)
-
-
-def test_a_map_without_gaussians_has_no_splats():
-    splats = splats_of({name: values[:0] for name, values in some(1).items()}, 1.0, 100)
-    assert splats.centres.shape == (0, 3) and splats.covariances.shape == (0, 3, 3)
