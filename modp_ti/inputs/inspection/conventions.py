@@ -43,6 +43,11 @@ class Convention:
     fault: str = ""
     mend: str = ""
 
+    @property
+    def code(self) -> str:
+        """Its machine-readable identifier."""
+        return self.name.replace(" ", "_").lower()
+
     def pose(self, T_camera_world: NDArray[np.float64]) -> NDArray[np.float64]:
         """The correct T_camera_world (4, 4) under this interpretation, up to a rotation of the world."""
         T = inverse_se3(T_camera_world) if self.inverse else T_camera_world

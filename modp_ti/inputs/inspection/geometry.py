@@ -75,8 +75,7 @@ def epipolar_score(
         poses: T_camera_world (4, 4) of each frame.
         convention: The interpretation of cameras and poses.
     """
-    fits: list[NDArray[np.bool_]] = [np.zeros(0, dtype=bool)]
-    errors: list[NDArray[np.float64]] = [np.zeros(0)]
+    fits, errors = [np.zeros(0, dtype=bool)], [np.zeros(0)]
     for pair in pairs:
         camera_a, camera_b = convention.camera(cameras[pair.a]), convention.camera(cameras[pair.b])
         T_a, T_b = convention.pose(poses[pair.a]), convention.pose(poses[pair.b])
@@ -179,7 +178,7 @@ def _by_features(geometry: Geometry) -> Iterator[Finding]:
     numbers = f"{stated.share:.0%} of {stated.matches:,} matched features fit, median error {stated.error:.2f} px"
     if best is not STATED:
         text = f"{best.fault}: as stated {numbers}; so read {score.share:.0%}, {score.error:.2f} px"
-        yield unusable(_code(best), text, best.mend)
+        yield unusable(best.code, text, best.mend)
         return
     if stated.share < DOUBTFUL:
         text = f"the poses do not fit the images, under no convention that was tried: as stated {numbers}"
@@ -207,48 +206,35 @@ def _by_points(geometry: Geometry) -> Iterator[Finding]:
         return
     if best is not STATED and error <= limit and error < BETTER_ERROR * stated:
         text = f"as stated the points' median reprojection error is {stated:.1f} px, so read {error:.2f} px"
-        yield unusable(_code(best), f"{best.fault}: {text}", best.mend)
+        yield unusable(best.code, f"{best.fault}: {text}", best.mend)
         return
     text = f"the points do not fit poses and intrinsics, under no convention that was tried: {stated:.1f} px"
     yield unusable("points_do_not_fit", text, "check that poses, points and images are of the same recording")
 
 
-def _code(convention: Convention) -> str:
-    return convention.name.lower().replace(" ", "_")
+def require_fitting(tracker: Tracker) -> None:
+    """Raise InputError if the poses of a tracker cannot be those of some of its images. It stays at its start.
 
-
-def first_look(tracker: Tracker) -> Geometry | None:
-    """Measure how some frames of a tracker fit their poses, None without any. The tracker stays at its start."""
+    Poses with errors that mapping corrects must pass, so that more must be wrong than for `judge_geometry`, unless
+    another convention fits well.
+    """
     looked_at = list(tracker.sampled(APART, GAPS[-1] + 1, PLACES))
     if not looked_at:
-        return None
+        return
     last = len(tracker.frames) - 1
 
     def further(shift: int) -> Sequence[NDArray[np.float64]]:
         return [tracker.frames[min(max(place + shift, 0), last)].T_camera_world for place, _ in looked_at]
 
     seen = survey((frame for _, frame in looked_at), len(looked_at), lambda _: None, PLACES)
-    return measure_geometry(seen, further)
-
-
-def require_fitting(tracker: Tracker) -> None:
-    """Raise InputError if the poses of a tracker cannot be those of its images."""
-    geometry = first_look(tracker)
-    reason = None if geometry is None else nonsense(geometry)
-    if reason is not None:
-        raise InputError(f"{reason}; --force maps it all the same (modp-ti check says more)")
-
-
-def nonsense(geometry: Geometry) -> str | None:
-    """Return in one line why poses cannot be those of the images, None if they may be.
-
-    Poses with errors that mapping corrects must pass, so that more must be wrong than for `judge_geometry`, unless
-    another convention fits well.
-    """
-    stated, error = geometry.epipolar[STATED], geometry.reprojection[STATED]
+    geometry = measure_geometry(seen, further)
+    stated = geometry.epipolar[STATED]
     few = FEW_WITHOUT_REMEDY if best_convention(geometry) is STATED else FEW
-    by_features = stated.matches >= LEAST_MATCHES
-    if stated.share >= few if by_features else error <= FAR_OFF * geometry.diagonal:
-        return None
-    unfit = [finding for finding in judge_geometry(geometry) if finding.severity is Severity.UNUSABLE]
-    return f"{unfit[0].text}; {unfit[0].mend}" if unfit else None
+    if stated.matches >= LEAST_MATCHES:
+        fits = stated.share >= few
+    else:
+        fits = geometry.reprojection[STATED] <= FAR_OFF * geometry.diagonal
+    unfit = [] if fits else [each for each in judge_geometry(geometry) if each.severity is Severity.UNUSABLE]
+    if unfit:
+        reason = f"{unfit[0].text}; {unfit[0].mend}"
+        raise InputError(f"{reason}; --force maps it all the same (modp-ti check says more)")

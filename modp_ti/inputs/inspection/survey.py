@@ -51,7 +51,6 @@ class FrameRecord:
     """Measurements of a frame.
 
     Attributes:
-        index: Index of the frame.
         name: Its name.
         timestamp: Its time in seconds.
         camera: Its camera.
@@ -66,7 +65,6 @@ class FrameRecord:
         views: Number of views that are taken at one time.
     """
 
-    index: int
     name: str
     timestamp: float
     camera: PinholeCamera
@@ -145,7 +143,6 @@ def _record(
     if before is not None and before.shape == thumbnail.shape:
         change = float(np.abs(thumbnail - before).mean())
     return FrameRecord(
-        index=frame.index,
         name=frame.name,
         timestamp=frame.timestamp,
         camera=frame.camera,
@@ -192,7 +189,7 @@ def matched_pair(a: int, features_a: Features, b: int, features_b: Features) -> 
     Returns:
         The matches that are inliers of a fundamental matrix; None if there are too few.
     """
-    pairs = match_anywhere(features_a, features_b).pairs
+    pairs = match_anywhere(features_a, features_b)
     if len(pairs) < FEWEST_MATCHES:
         return None
     pixels_a, pixels_b = features_a.pixels[pairs[:, 0]], features_b.pixels[pairs[:, 1]]

@@ -9,11 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from modp_ti.inputs.multiview.features import Features, detect_features
+from modp_ti.inputs.multiview.features import FLOW_WINDOW, Features, detect_features, flow_there_and_back
 
 WANTED = 450  # features that are tracked
 DESCRIBED_SIDE = 400  # longer side at which SIFT features are detected: 60 % of the time that 640 px take
-WINDOW = (21, 21)
 LEVELS = 4  # pyramid levels above the image itself, at most
 # Levels above the image, forwards and backwards, where the predicted motion is at most SLOW px in the median. The way
 # back starts where it should end. All levels are used if a smaller share of the points than PREDICTED_SHARE is tracked.
@@ -135,18 +134,10 @@ def _flow(
     # In cv2 the first pixel's centre is 0, and points are float32.
     start = (pixels - 0.5).astype(np.float32)[:, None]
     there = np.clip(guess - 0.5, (-width, -height), (2 * width, 2 * height)).astype(np.float32)[:, None]
-    options = {
-        "winSize": WINDOW,
-        "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
-        "criteria": (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.02),
-    }
-    there, found, _ = cv2.calcOpticalFlowPyrLK(before, after, start, there.copy(), maxLevel=levels, **options)
-    back, returned, _ = cv2.calcOpticalFlowPyrLK(after, before, there, start.copy(), maxLevel=return_levels, **options)
-    found = (found[:, 0] > 0) & (returned[:, 0] > 0) & np.isfinite(there).all(axis=(1, 2))
-    found &= np.linalg.norm(back - start, axis=(1, 2)) < ROUND_TRIP
+    there, off = flow_there_and_back(before, after, start, there, levels, return_levels)
     result = there[:, 0].astype(np.float64) + 0.5
-    found &= (result >= BORDER).all(axis=1) & (result <= (width - BORDER, height - BORDER)).all(axis=1)
-    return result, found
+    inside = (result >= BORDER).all(axis=1) & (result <= (width - BORDER, height - BORDER)).all(axis=1)
+    return result, (off < ROUND_TRIP) & inside
 
 
 def _lit_alike(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -185,7 +176,7 @@ def _gains_of_rows(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> NDArr
 def _levels(grey: NDArray[np.uint8]) -> int:
     """Number of pyramid levels above the image whose shorter side still exceeds two windows."""
     levels = 0
-    while levels < LEVELS and min(grey.shape) >> (levels + 1) > 2 * WINDOW[0]:
+    while levels < LEVELS and min(grey.shape) >> (levels + 1) > 2 * FLOW_WINDOW[0]:
         levels += 1
     return levels
 

@@ -57,7 +57,7 @@ class Initialisation:
             frame.track(last)
             if len(frame.ids) < max(FEWEST_SHARED, 0.35 * len(last.ids)) <= len(last.ids):  # flow has lost too many
                 a, b = last.described, frame.described
-                pairs = match_anywhere(a, b).pairs
+                pairs = match_anywhere(a, b)
                 ids = self._new_ids(len(pairs))
                 last.append(ids, a.pixels[pairs[:, 0]])
                 frame.append(ids, b.pixels[pairs[:, 1]])

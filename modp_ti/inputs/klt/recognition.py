@@ -13,7 +13,7 @@ from fields.geometry.se3 import inverse_se3, motion_around, moved_pose, scale_of
 from modp_ti.inputs.klt.frame import describe
 from modp_ti.inputs.klt.landmark_map import Keyframe, LandmarkMap
 from modp_ti.inputs.multiview.appearance import nearest_words, vlad
-from modp_ti.inputs.multiview.features import Features, essential_matrix, match_anywhere
+from modp_ti.inputs.multiview.features import Features, epipolar_lines, essential_matrix, match_anywhere
 from modp_ti.inputs.multiview.reprojection import pose_from_points, ray_errors
 
 # Thresholds in px of the tracked image. MAX_ERROR is RANSAC's, and is wide because many depths are those of neighbours.
@@ -60,7 +60,7 @@ def place_by_features(
         T_camera_world (4, 4) of the frame, and the matches (M, 2) that agree: indices of SIFT features in the keyframe
         and in the frame. None if too few agree.
     """
-    pairs = match_anywhere(described_keyframe(keyframe), features).pairs
+    pairs = match_anywhere(described_keyframe(keyframe), features)
     if len(pairs) < FEWEST:
         return None
     xyz = world_points(landmarks, keyframe)[pairs[:, 0]]
@@ -98,9 +98,8 @@ def inherited(
     described = described_keyframe(keyframe)
     a, b = described.pixels[pairs[:, 0]], features.pixels[pairs[:, 1]]
     rays_a, rays_b = landmarks.lens.rays(a), landmarks.lens.rays(b)
-    lines = np.c_[rays_a, np.ones(len(a))] @ essential_matrix(keyframe.T_camera_world, T).T
+    lines = epipolar_lines(essential_matrix(keyframe.T_camera_world, T), rays_a)
     off = np.abs((lines * np.c_[rays_b, np.ones(len(b))]).sum(axis=1))
-    off /= np.maximum(np.linalg.norm(lines[:, :2], axis=1), 1e-12)
     good = off * landmarks.lens.focal < MAX_OFF_LINE
     slots, b = pairs[good, 0], b[good]
     slots, first = np.unique(slots, return_index=True)

@@ -85,7 +85,16 @@ def adjusted_bundle(
     if not refined:
         config.set_constant_cam_intrinsics(1)
 
-    options = _options(steps, loss_width, refined)
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.refine_focal_length, options.refine_extra_params = "focal" in refined, "distortion" in refined
+    options.refine_principal_point = options.refine_sensor_from_rig = False
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = loss_width
+    solver = options.ceres.solver_options
+    solver.max_num_iterations = steps
+    solver.num_threads = 1  # with several threads, the order of summation and so the result would vary between runs
+    solver.function_tolerance = TOLERANCE
     summary = pycolmap.create_default_bundle_adjuster(options, config, model).solve()
     if not summary.is_solution_usable():
         return None
@@ -95,7 +104,9 @@ def adjusted_bundle(
     # The declared type is the base class, which has no Ceres summary.
     solved = isinstance(summary, pycolmap.CeresBundleAdjustmentSummary)
     cost = summary.ceres_summary.final_cost / len(view) if solved else 0.0
-    return Bundle(_adjusted_poses(model, free), numbers[finite], places[finite], model.camera(1), float(cost))
+    found = {k: np.vstack([model.image(k + 1).cam_from_world().matrix(), (0.0, 0.0, 0.0, 1.0)]) for k in free}
+    found = {k: T for k, T in found.items() if np.isfinite(T).all()}
+    return Bundle(found, numbers[finite], places[finite], model.camera(1), float(cost))
 
 
 def _add_views(
@@ -107,10 +118,9 @@ def _add_views(
     pixels: NDArray[np.float64],
     free: Collection[int],
 ) -> Iterator[tuple[int, pycolmap.Track]]:
-    """Add the views with their observations. View k becomes image k + 1.
+    """Add the views with their observations, view k as image k + 1.
 
-    Returns:
-        Every observed point, in the order of their first observations, with its track.
+    Yields every observed point, in the order of their first observations, with its track.
     """
     from modp_ti.files.quiet_pycolmap import pycolmap
 
@@ -131,32 +141,6 @@ def _add_views(
     starts = [0, *ends[:-1]]
     for number, start, end in zip(numbers[np.sort(first)].tolist(), starts, ends, strict=True):
         yield number, pycolmap.Track(elements[start:end])
-
-
-def _adjusted_poses(model: pycolmap.Reconstruction, free: Collection[int]) -> dict[int, NDArray[np.float64]]:
-    """T_camera_world (4, 4) of the free views, without those that are not finite."""
-    found = {}
-    for k in free:
-        matrix = model.image(k + 1).cam_from_world().matrix()
-        if np.isfinite(matrix).all():
-            found[k] = np.vstack([matrix, (0.0, 0.0, 0.0, 1.0)])
-    return found
-
-
-def _options(steps: int, loss_width: float, refined: Collection[Refinable]) -> pycolmap.BundleAdjustmentOptions:
-    from modp_ti.files.quiet_pycolmap import pycolmap
-
-    options = pycolmap.BundleAdjustmentOptions()
-    options.print_summary = False
-    options.refine_focal_length, options.refine_extra_params = "focal" in refined, "distortion" in refined
-    options.refine_principal_point = options.refine_sensor_from_rig = False
-    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    options.ceres.loss_function_scale = loss_width
-    solver = options.ceres.solver_options
-    solver.max_num_iterations = steps
-    solver.num_threads = 1  # with several threads, the order of summation and so the result would vary between runs
-    solver.function_tolerance = TOLERANCE
-    return options
 
 
 def adjusted_apart(*arguments: object, **keywords: object) -> Bundle | None:

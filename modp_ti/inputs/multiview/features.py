@@ -12,6 +12,7 @@ MAX_SIDE = 1000
 MAX_FEATURES = 2000
 RATIO = 0.8
 CONTRAST = 0.02
+FLOW_WINDOW = (21, 21)  # px
 
 # Descriptors are integers whose norm is at most this number. Their float32 dot products are exact, so that matches do
 # not depend on how a matrix product is split over threads.
@@ -42,20 +43,9 @@ class Features:
         return Features(self.pixels[kept], self.descriptors[kept], self.pixel)
 
 
-@dataclass(frozen=True)
-class Matches:
-    """Matches between the features of two views.
-
-    Attributes:
-        pairs: (M, 2) int64 indices of the features in both views.
-        ratio: (M,) squared descriptor distance over that to the second-best match; smaller is more distinctive.
-    """
-
-    pairs: NDArray[np.int64]
-    ratio: NDArray[np.floating]
-
-    def __len__(self) -> int:
-        return len(self.pairs)
+Matches = tuple[NDArray[np.int64], NDArray[np.floating]]
+"""Matches between two views: indices (M, 2) of the features in both, and the ratio (M,) of the squared descriptor
+distance to that of the second-best match; smaller is more distinctive."""
 
 
 def detect_features(image: NDArray[np.uint8], most: int = MAX_FEATURES, side: int = MAX_SIDE) -> Features:
@@ -101,6 +91,42 @@ def shrunk_grey(image: NDArray[np.uint8], most: int) -> tuple[NDArray[np.uint8],
     return np.asarray(grey, np.uint8), pixel, np.divide((width, height), size)
 
 
+def flow_there_and_back(
+    one: NDArray[np.uint8],
+    other: NDArray[np.uint8],
+    start: NDArray[np.float32],
+    guess: NDArray[np.float32],
+    levels: int,
+    return_levels: int,
+) -> tuple[NDArray[np.float32], NDArray[np.floating]]:
+    """Track points by pyramidal Lucas-Kanade to another image and back.
+
+    Args:
+        one: (H, W) uint8.
+        other: (H, W) uint8.
+        start: (N, 1, 2) points in `one`, in cv2's pixels (first centre at 0).
+        guess: (N, 1, 2) their expected positions in `other`.
+        levels: Pyramid levels above the image.
+        return_levels: Those on the way back, which starts where it should end.
+
+    Returns:
+        Positions (N, 1, 2) in `other`, and the distances (N,) [px] from the start after the way back; infinite where a
+        point was lost.
+    """
+    import cv2
+
+    options = {
+        "winSize": FLOW_WINDOW,
+        "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
+        "criteria": (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.02),
+    }
+    there, found, _ = cv2.calcOpticalFlowPyrLK(one, other, start, guess.copy(), maxLevel=levels, **options)
+    back, returned, _ = cv2.calcOpticalFlowPyrLK(other, one, there, start.copy(), maxLevel=return_levels, **options)
+    there = np.asarray(there, np.float32)
+    found = (found[:, 0] > 0) & (returned[:, 0] > 0) & np.isfinite(there).all(axis=(1, 2))
+    return there, np.where(found, np.linalg.norm(back - start, axis=(1, 2)), np.inf)
+
+
 def essential_matrix(T_a_world: NDArray[np.float64], T_b_world: NDArray[np.float64]) -> NDArray[np.float64]:
     """Essential matrix E (3, 3) with x_b^T E x_a = 0 for normalised coordinates x_a, x_b of a point in two views.
 
@@ -113,10 +139,19 @@ def essential_matrix(T_a_world: NDArray[np.float64], T_b_world: NDArray[np.float
     return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ T_b_a[:3, :3]
 
 
-def match_anywhere(a: Features, b: Features) -> Matches:
-    """Find mutual best matches between two images that pass the ratio test, without an epipolar constraint."""
+def match_anywhere(a: Features, b: Features) -> NDArray[np.int64]:
+    """Pairs (M, 2) of mutual best matches between two images that pass the ratio test, wherever they are."""
     nowhere = np.zeros((3, 3))  # a zero essential matrix accepts all positions
-    return match_features(a.descriptors, b.descriptors, a.pixels, b.pixels, nowhere, 1.0)
+    return match_features(a.descriptors, b.descriptors, a.pixels, b.pixels, nowhere, 1.0)[0]
+
+
+def epipolar_lines(essential: NDArray[np.float64], rays: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Lines (N, 3) in view b, with normals of length 1, of normalised coordinates (N, 2) in view a.
+
+    Without camera motion there is no line: all are 0.
+    """
+    lines = np.c_[rays, np.ones(len(rays))] @ essential.T
+    return lines / np.maximum(np.linalg.norm(lines[:, :2], axis=1, keepdims=True), 1e-12)
 
 
 def match_features(
@@ -138,12 +173,12 @@ def match_features(
         band: Largest distance from the epipolar line in view b, in normalised coordinates (pixels / focal length).
     """
     if len(descriptors_a) < 2 or len(descriptors_b) < 2:
-        return Matches(np.zeros((0, 2), dtype=np.int64), np.zeros(0))
+        return np.zeros((0, 2), dtype=np.int64), np.zeros(0)
     a, b = descriptors_a.astype(np.float32), descriptors_b.astype(np.float32)
     similarity = a @ b.T
-    lines = np.c_[rays_a, np.ones(len(rays_a))] @ essential.T  # (Na, 3)
-    lines /= np.maximum(np.linalg.norm(lines[:, :2], axis=1, keepdims=True), 1e-12)
-    off = lines.astype(np.float32) @ np.c_[rays_b, np.ones(len(rays_b))].T.astype(np.float32)
+    off = epipolar_lines(essential, rays_a).astype(np.float32) @ np.c_[rays_b, np.ones(len(rays_b))].T.astype(
+        np.float32
+    )
     similarity[~(np.abs(off) <= band)] = -1.0  # written so that NaN, where the lens model has no ray, is excluded
 
     # First the mutual best matches, by passes over whole rows. The second best is needed only for these few.
@@ -162,7 +197,7 @@ def match_features(
     square_a = norm_a[second_a] + norm_b[best_b] - 2 * columns[np.arange(len(row)), second_a]
     ratio = square / np.maximum(np.minimum(square_a, square_b), 1.0)
     clear = ratio < RATIO**2
-    return Matches(np.stack([row[clear], best_b[clear]], axis=1), ratio[clear])
+    return np.stack([row[clear], best_b[clear]], axis=1), ratio[clear]
 
 
 def feature_tracks(
@@ -192,12 +227,12 @@ def feature_tracks(
     offset = np.concatenate([[0], np.cumsum([len(each) for each in pixels])]).astype(np.int64)
     place = _first_at_position(pixels, offset)
 
-    joined = [place[found.pairs + offset[[a, b]]] for a, b, found in matches]
+    joined = [place[pairs + offset[[a, b]]] for a, b, (pairs, _) in matches]
     if not joined:
         nothing = np.zeros(0, dtype=np.int64)
         return nothing, nothing, nothing
-    late = np.concatenate([np.full(len(found), aside[a] or aside[b]) for a, b, found in matches])
-    clearest = np.lexsort((np.concatenate([found.ratio for _, _, found in matches]), late))
+    late = np.concatenate([np.full(len(pairs), aside[a] or aside[b]) for a, b, (pairs, _) in matches])
+    clearest = np.lexsort((np.concatenate([ratio for _, _, (_, ratio) in matches]), late))
     nodes = np.unique(np.concatenate(joined))
     frame = np.searchsorted(offset, nodes, side="right") - 1
     links = np.searchsorted(nodes, np.concatenate(joined)[clearest])
@@ -209,12 +244,7 @@ def feature_tracks(
 
 
 def _first_at_position(pixels: Sequence[NDArray[np.float64]], offset: NDArray[np.int64]) -> NDArray[np.int64]:
-    """For each feature of all views, the first feature of its view at the same position.
-
-    Args:
-        pixels: (N, 2) features of each view.
-        offset: Number of the first feature of each view, and of all features at the end.
-    """
+    """For each feature of all views, the first of its view at the same position; views begin at `offset`."""
     place = np.arange(offset[-1])
     for i, each in enumerate(pixels):
         if len(each):
@@ -224,15 +254,9 @@ def _first_at_position(pixels: Sequence[NDArray[np.float64]], offset: NDArray[np
 
 
 def _roots(frame: NDArray[np.int64], links: NDArray[np.int64], held_out: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Join nodes by their links in order (union-find), except where a track would get two nodes of one view.
+    """Roots (N,) of tracks of nodes, joined by links (M, 2) in order, except where a view would get two nodes in one.
 
-    Args:
-        frame: (N,) view of each node.
-        links: (M, 2) pairs of nodes.
-        held_out: (N,) nodes of held-out views. Each may be added to one track but joins no two tracks.
-
-    Returns:
-        The root node (N,) of each node's track.
+    Each node of a held-out view (N,) may be added to one track but joins no two tracks.
     """
     alone = held_out.tolist()
     parent = list(range(len(frame)))

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from modp_ti.inputs.multiview.features import essential_matrix, shrunk_grey
+from modp_ti.inputs.multiview.features import epipolar_lines, essential_matrix, flow_there_and_back, shrunk_grey
+from modp_ti.inputs.multiview.reprojection import Observations
 from modp_ti.inputs.protocol import Progress
 from modp_ti.inputs.replay import PosedImage
 from modp_ti.inputs.sources import ImageSource
@@ -18,30 +18,13 @@ CORNERS = 800  # corners tracked at a time
 REFILL_BELOW = 0.8  # share of CORNERS below which new ones are detected
 MIN_DISTANCE = 1 / 80  # distance between new corners, as a share of the longer side
 QUALITY = 0.01  # response of the weakest corner, as a share of the strongest
-WINDOW, LEVELS = 21, 3  # window [px] and pyramid levels of the optical flow
+LEVELS = 3  # pyramid levels of the optical flow
 THERE_AND_BACK = 1.0  # largest forward-backward error [px]
 EPIPOLAR_BAND = 3.0  # largest distance [px] from the epipolar line, for exact poses
 
 # Frame pairs that are tested to decide whether a sequence is a video, and the share of corners that must be tracked.
 SAMPLES = 8
 SURVIVING = 0.5
-
-
-@dataclass(frozen=True)
-class FollowedFeatures:
-    """Observations of tracked corners.
-
-    Attributes:
-        frame: (M,) int64 frame of each observation.
-        track: (M,) int64 track of each observation.
-        pixels: (M, 2) in the stored image, with pixel centres at +0.5.
-        pixel: Pixel size of the resized images used for tracking, in pixels of the stored images.
-    """
-
-    frame: NDArray[np.int64]
-    track: NDArray[np.int64]
-    pixels: NDArray[np.float64]
-    pixel: float
 
 
 class _Picture:
@@ -53,13 +36,9 @@ class _Picture:
         self.size = (self.grey.shape[1], self.grey.shape[0])
         self.frame = frame
 
-    def stored(self, places: NDArray[np.float32]) -> NDArray[np.float64]:
-        """Pixels of the stored image, for pixels of the resized image in cv2's convention (first centre at 0)."""
-        return (places.astype(np.float64) + 0.5) * self._to_stored
-
     def rays(self, places: NDArray[np.float32]) -> NDArray[np.float64]:
-        """Normalised coordinates (N, 2) of pixels in the resized image."""
-        return self.frame.undistorter.rays(self.stored(places))
+        """Normalised coordinates (N, 2) of pixels in the resized image in cv2's convention (first centre at 0)."""
+        return self.frame.undistorter.rays((places.astype(np.float64) + 0.5) * self._to_stored)
 
     def places(self, rays: NDArray[np.float64]) -> NDArray[np.float32]:
         """Pixels in the resized image of normalised coordinates (N, 2)."""
@@ -74,8 +53,8 @@ def follow_features(
     solves: NDArray[np.bool_],
     progress: Progress | None = None,
     band: float = EPIPOLAR_BAND,
-) -> FollowedFeatures:
-    """Detect corners and track each one for as long as it is found.
+) -> Observations:
+    """Detect corners and track each one for as long as it is found. Each is a point of the observations.
 
     Args:
         images: Source of the images.
@@ -87,17 +66,16 @@ def follow_features(
     """
     chain = np.flatnonzero(solves)
     nothing = np.zeros(0, np.int64)
-    seen = [(nothing, nothing, np.zeros((0, 2)))]  # frames, tracks and pixels
-    places, tracks, next_track = np.zeros((0, 2), np.float32), np.zeros(0, np.int64), 0
+    seen = [(nothing, nothing, np.zeros((0, 2)), np.zeros(0))]  # frames, points, rays and their uncertainty
+    places, tracks, next_track = np.zeros((0, 2), np.float32), nothing, 0
     before: _Picture | None = None
-    pixel = 1.0
 
     def tell(index: int, place: NDArray[np.float32], track: NDArray[np.int64], picture: _Picture) -> None:
-        seen.append((np.full(len(track), index, np.int64), track, picture.stored(place)))
+        sigma = picture.pixel / picture.frame.undistorter.raw.focal
+        seen.append((np.full(len(track), index), track, picture.rays(place), np.full(len(track), sigma)))
 
     for done, index in enumerate(chain.tolist()):
         picture = _Picture(images, frames[index])
-        pixel = picture.pixel
         if before is not None:
             places, kept = _followed(before, picture, places, band)
             tracks = tracks[kept]
@@ -116,8 +94,7 @@ def follow_features(
         before = picture
         if progress is not None:
             progress("following features", done + 1, len(chain))
-    frame, track, pixels = map(np.concatenate, zip(*seen, strict=True))
-    return FollowedFeatures(frame, track, pixels, pixel)
+    return Observations(*map(np.concatenate, zip(*seen, strict=True)))
 
 
 def looks_like_video(images: ImageSource, frames: Sequence[PosedImage], solves: NDArray[np.bool_]) -> bool:
@@ -161,8 +138,6 @@ def _followed(
     The initial position is predicted from the rotation between the two poses. A result must pass the forward-backward
     check and lie near the epipolar line.
     """
-    import cv2
-
     if len(places) == 0:
         return places, np.zeros(0, np.int64)
     rays = one.rays(places)
@@ -174,31 +149,13 @@ def _followed(
     inside = ((guess >= 0) & (guess < other.size)).all(axis=1)
     numbers, guess = numbers[inside], guess[inside]
     if len(numbers) == 0:
-        return np.zeros((0, 2), np.float32), numbers
-    start = np.ascontiguousarray(places[numbers])
-    options = {
-        "winSize": (WINDOW, WINDOW),
-        "maxLevel": LEVELS,
-        "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
-        "criteria": (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.02),
-    }
-    there, found, _ = cv2.calcOpticalFlowPyrLK(one.grey, other.grey, start, guess.copy(), **options)
-    back, found_back, _ = cv2.calcOpticalFlowPyrLK(other.grey, one.grey, there, start.copy(), **options)
-    there = np.asarray(there, np.float32)
-    good = (found.ravel() > 0) & (found_back.ravel() > 0)
-    good &= np.linalg.norm(back - start, axis=1) <= THERE_AND_BACK
+        return guess, numbers
+    start = places[numbers, None]
+    there, off = flow_there_and_back(one.grey, other.grey, start, guess[:, None], LEVELS, LEVELS)
+    there, good = there[:, 0], off <= THERE_AND_BACK
     good &= ((there >= 0) & (there <= np.subtract(other.size, 1))).all(axis=1)
-    good[good] = _near_line(one, other, rays[numbers[good]], other.rays(there[good]), band)
+    T_one, T_other = one.frame.T_camera_world, other.frame.T_camera_world
+    lines = epipolar_lines(essential_matrix(T_one, T_other), rays[numbers[good]])
+    off_line = np.abs((lines * np.c_[other.rays(there[good]), np.ones(len(lines))]).sum(axis=1))
+    good[good] = off_line * (other.frame.undistorter.raw.focal / other.pixel) <= band
     return there[good], numbers[good]
-
-
-def _near_line(
-    one: _Picture, other: _Picture, rays_one: NDArray[np.float64], rays_other: NDArray[np.float64], band: float
-) -> NDArray[np.bool_]:
-    """Mask (N,) of the correspondences within `band` px of their epipolar line."""
-    E = essential_matrix(one.frame.T_camera_world, other.frame.T_camera_world)
-    lines = np.c_[rays_one, np.ones(len(rays_one))] @ E.T
-    length = np.linalg.norm(lines[:, :2], axis=1)
-    off = np.abs((lines * np.c_[rays_other, np.ones(len(rays_other))]).sum(axis=1))
-    # Without camera motion there is no epipolar line: both sides are about 0, and the correspondence is accepted.
-    return off * (other.frame.undistorter.raw.focal / other.pixel) <= band * np.maximum(length, 1e-12)

@@ -119,15 +119,8 @@ def _median_error(poses: NDArray[np.float64], seen: Observations, solves: NDArra
 class _Sequence:
     """Frames whose features are observed.
 
-    Args:
-        images: Source of the images.
-        frames: The F frames with their poses.
-        solves: (F,) False for held-out frames.
-        progress: Called during the computation.
-
-    Attributes:
-        poses: (F, 4, 4) the given T_camera_world, of a world that begins near the cameras.
-        follows: Whether corners are tracked from frame to frame, instead of matching SIFT features.
+    `poses` are the given ones, of a world that begins near the cameras. `follows`: corners are tracked from frame to
+    frame, instead of matching SIFT features.
     """
 
     def __init__(
@@ -146,12 +139,7 @@ class _Sequence:
             count = len(self._frames)
             most = MAX_FEATURES if count <= FEW_FRAMES else FEATURES_OF_MANY_FRAMES
             return self.matched(self.poses, np.arange(count), most, NEIGHBOURS, band)
-        found = follow_features(self._images, self._frames, self._solves, self._progress, band)
-        rays = np.zeros((len(found.frame), 2))
-        for i, frame in enumerate(self._frames):
-            mine = found.frame == i
-            rays[mine] = frame.undistorter.rays(found.pixels[mine])
-        return Observations(found.frame, found.track, rays, found.pixel / self._focal[found.frame])
+        return follow_features(self._images, self._frames, self._solves, self._progress, band)
 
     def matched(
         self, poses: NDArray[np.float64], views: NDArray[np.int64], most: int, neighbours: int, band: float

@@ -122,7 +122,7 @@ def _depth_at(view: RenderedView, camera: PinholeCamera, pixels: NDArray[np.floa
 
 def matched(view: PlacedFeatures, features: Features) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Match a render's features with those of a picture; returns world points (M, 3) and pixels (M, 2)."""
-    pairs = match_anywhere(view[0], features).pairs
+    pairs = match_anywhere(view[0], features)
     return view[1][pairs[:, 0]], features.pixels[pairs[:, 1]]
 
 

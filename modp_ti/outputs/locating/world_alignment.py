@@ -93,14 +93,14 @@ def world_alignment(frames: Sequence[PlacedFrame]) -> WorldAlignment | None:
     best: list[int] = []
     for frame, log_scale in zip(known, log_scales, strict=True):
         S = motion_around(frame.T_camera_tracker, frame.T_camera_map, float(np.exp(log_scale)))
-        agreeing = [i for i, other in enumerate(known) if _apart(S, other) <= _limit(other)]
+        agreeing = [i for i, other in enumerate(known) if np.linalg.norm(_motion(S, other)) <= _limit(other)]
         if len(agreeing) > len(best):
             best = agreeing
     if len(best) < AGREEING or 2 * len(best) <= len(known):
         return None
     chosen = [known[i] for i in best]
     S = _joint(chosen, float(np.median([log_scales[i] for i in best])))
-    residual = float(np.sqrt(np.mean([_apart(S, frame) ** 2 for frame in chosen])))
+    residual = float(np.sqrt(np.mean([np.linalg.norm(_motion(S, frame)) ** 2 for frame in chosen])))
     return WorldAlignment(S, float(scale_of(S)), len(frames), len(chosen), residual)
 
 
@@ -141,11 +141,6 @@ def _motion(S: NDArray[np.float64], frame: PlacedFrame) -> NDArray[np.float64]:
     """Image motion (6,) [px] from a frame's pose in the map to its pose by the tracker."""
     xi = log_se3(moved_pose(S, frame.T_camera_tracker) @ inverse_se3(frame.T_camera_map))
     return np.asarray(np.linalg.solve(_metric(frame), xi), dtype=np.float64)
-
-
-def _apart(S: NDArray[np.float64], frame: PlacedFrame) -> float:
-    """Image motion [px] between a frame's pose in the map and its pose by the tracker."""
-    return float(np.linalg.norm(_motion(S, frame)))
 
 
 def _limit(frame: PlacedFrame) -> float:
