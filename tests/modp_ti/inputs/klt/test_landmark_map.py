@@ -106,13 +106,14 @@ def test_triangulation_asks_for_parallax():
             np.testing.assert_allclose(found, xyz, atol=1e-9)
 
 
-def test_bundle_adjustment_finds_the_scene_and_leaves_held_keyframes():
+@pytest.mark.parametrize("apart", [False, True])
+def test_bundle_adjustment_finds_the_scene_and_leaves_held_keyframes_in_a_process_of_its_own_too(apart):
     landmarks, xyz = small_map()
     rng = np.random.default_rng(6)
     landmarks.xyz[:150] += 0.01 * rng.standard_normal(xyz.shape)
     for keyframe in landmarks.keyframes[2:]:
         keyframe.T_camera_world = exp_se3(0.01 * rng.standard_normal(6)) @ keyframe.T_camera_world
-    assert landmarks.adjust(free=[2, 3, 4, 5], held=[0, 1], steps=50) < 1e-6
+    assert landmarks.adjust(free=[2, 3, 4, 5], held=[0, 1], steps=50, apart=apart) < 1e-6
     for i, keyframe in enumerate(landmarks.keyframes):
         np.testing.assert_allclose(keyframe.T_camera_world, way(i), atol=1e-4 if i > 1 else 0)
     np.testing.assert_allclose(landmarks.xyz[:150], xyz, atol=1e-3)
@@ -124,10 +125,13 @@ def test_bundle_adjustment_finds_the_focal_length():
     assert landmarks.lens.focal == pytest.approx(500.0, rel=1e-3)
 
 
-def test_an_adjustment_without_a_solution_leaves_the_map_and_is_counted():
+@pytest.mark.parametrize("fails", ["Ceres", "the process"])
+def test_an_adjustment_without_a_solution_leaves_the_map_and_is_counted(monkeypatch, fails):
     landmarks, xyz = small_map()
-    landmarks.keyframes[3].pixels[7] = np.nan  # Ceres cannot evaluate the cost
-    assert landmarks.adjust(free=[2, 3, 4, 5], held=[0, 1], steps=50) == np.inf
+    if fails == "Ceres":
+        landmarks.keyframes[3].pixels[7] = np.nan
+    monkeypatch.setattr("modp_ti.inputs.multiview.bundle_adjustment.CODE", "import os; os._exit(137)")
+    assert landmarks.adjust([2, 3, 4, 5], [0, 1], steps=50, apart=fails == "the process") == np.inf
     np.testing.assert_array_equal(landmarks.xyz[:150], xyz)
     assert landmarks.unsolved == 1
 

@@ -34,7 +34,7 @@ def test_features_match_only_where_geometry_allows(plane_scene):
     rays_a, rays_b = ((np.c_[f.pixels, np.ones(len(f.pixels))] @ K_inverse.T)[:, :2] for f in (a, b))
     T = plane_scene.T_camera_world
     E = essential_matrix(T[0], T[1])
-    found = match_features(a.descriptors, b.descriptors, rays_a, rays_b, E, band=2 / 300).pairs
+    found = match_features(a.descriptors, b.descriptors, rays_a, rays_b, E, band=2 / 300)[0]
     assert len(found) > 100
     assert len(np.unique(found[:, 0])) == len(np.unique(found[:, 1])) == len(found)
     # oracle: the homography of the plane z = 0
@@ -43,11 +43,11 @@ def test_features_match_only_where_geometry_allows(plane_scene):
     error = np.linalg.norm(moved[:, :2] / moved[:, 2:] - b.pixels[found[:, 1]], axis=1)
     assert np.median(error) < 0.3, "pixel centres are at +0.5 in both"
     assert (error < 2).mean() > 0.95
-    unrelated = match_features(a.descriptors, b.descriptors, rays_a, rays_b, E + 0.3, band=2 / 300)
+    unrelated, _ = match_features(a.descriptors, b.descriptors, rays_a, rays_b, E + 0.3, band=2 / 300)
     assert len(unrelated) < 0.3 * len(found)
-    assert len(match_features(a.descriptors[:1], b.descriptors, rays_a[:1], rays_b, E, 1.0)) == 0
+    assert len(match_features(a.descriptors[:1], b.descriptors, rays_a[:1], rays_b, E, 1.0)[0]) == 0
     nowhere = np.full_like(rays_a, np.nan)
-    assert len(match_features(a.descriptors, a.descriptors, nowhere, nowhere, np.eye(3), 1.0)) == 0
+    assert len(match_features(a.descriptors, a.descriptors, nowhere, nowhere, np.eye(3), 1.0)[0]) == 0
 
 
 # The second is searched at a smaller size.
@@ -73,7 +73,7 @@ def test_features_lie_at_the_centres_of_blobs(size):
 
 def matches(a: int, b: int, *found: tuple[int, int, float]) -> tuple[int, int, Matches]:
     pairs = np.array([each[:2] for each in found], dtype=np.int64).reshape(-1, 2)
-    return a, b, Matches(pairs, np.array([each[2] for each in found]))
+    return a, b, (pairs, np.array([each[2] for each in found]))
 
 
 def places(*counts: int) -> list[np.ndarray]:
@@ -88,38 +88,25 @@ def tracks(pixels, *found) -> set[frozenset[tuple[int, int]]]:
     }
 
 
-def test_matches_that_share_a_feature_are_one_track():
+def test_matches_are_joined_to_tracks_the_clearest_first_and_none_has_two_places_of_a_view():
     found = matches(0, 1, (0, 3, 0.1), (1, 4, 0.1)), matches(1, 2, (3, 2, 0.1)), matches(0, 3, (0, 0, 0.2))
     assert tracks(places(5, 5, 5, 5), *found) == {
         frozenset({(0, 0), (1, 3), (2, 2), (3, 0)}),
         frozenset({(0, 1), (1, 4)}),
     }
-
-
-def test_a_match_to_a_second_place_of_a_view_is_left_out_and_the_clearest_ones_stay():
     pixels = places(2, 2, 2)
     clear, chain = matches(0, 1, (0, 0, 0.1), (1, 1, 0.1)), matches(1, 2, (0, 0, 0.2), (1, 1, 0.2))
     wrong = matches(0, 2, (0, 1, 0.5))  # would join both tracks
     expected = {frozenset({(0, 0), (1, 0), (2, 0)}), frozenset({(0, 1), (1, 1), (2, 1)})}
     assert tracks(pixels, clear, chain, wrong) == tracks(pixels, wrong, chain, clear) == expected
     clearest = matches(0, 2, (0, 1, 0.01))
-    assert tracks(pixels, clear, chain, clearest) == {
-        frozenset({(0, 0), (1, 0), (2, 1)}),
-        frozenset({(0, 1), (1, 1)}),
-    }
+    assert tracks(pixels, clear, chain, clearest) == {frozenset({(0, 0), (1, 0), (2, 1)}), frozenset({(0, 1), (1, 1)})}
 
-
-def test_features_at_one_place_are_one():
     pixels = places(3, 3, 3)
-    pixels[1][2] = pixels[1][0]  # two orientations
+    pixels[1][2] = pixels[1][0]  # two orientations of one place
     found = matches(0, 1, (0, 0, 0.1)), matches(1, 2, (2, 1, 0.1))
     assert tracks(pixels, *found) == {frozenset({(0, 0), (1, 0), (2, 1)})}
-
-
-def test_no_matches_give_no_tracks():
-    for found in ([], [matches(0, 1)]):
-        view, number, track = feature_tracks(places(3, 0), found)
-        assert len(view) == len(number) == len(track) == 0
+    assert not tracks(places(3, 0)) and not tracks(places(3, 0), matches(0, 1))
 
 
 def test_a_view_set_aside_joins_no_tracks_and_is_told_of_those_it_shows():

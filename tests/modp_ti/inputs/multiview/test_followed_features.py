@@ -51,26 +51,25 @@ def posed(video, camera: Undistorter | None = None) -> tuple[ImageFolder, list[P
     return images, [PosedImage(name, undistorter, T) for name, T in zip(images.names, video[1], strict=True)]
 
 
-def on_plane(T: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Where (N, 2) on the plane z = 0 the rays of pixels meet it: the oracle."""
-    H = CAMERA.matrix() @ T[:3, [0, 1, 3]]
-    p = np.c_[pixels, np.ones(len(pixels))] @ np.linalg.inv(H).T
+def on_plane(T: np.ndarray, rays: np.ndarray) -> np.ndarray:
+    """Where (N, 2) rays meet the plane z = 0: the oracle."""
+    p = np.c_[rays, np.ones(len(rays))] @ np.linalg.inv(T[:3, [0, 1, 3]]).T
     return p[:, :2] / p[:, 2:]
 
 
 def test_a_corner_stays_on_its_place_of_the_plane(video):
     images, frames = posed(video)
     found = follow_features(images, frames, np.ones(FRAMES, bool))
-    places = np.zeros((len(found.frame), 2))
+    places = np.zeros((len(found), 2))
     for i, T in enumerate(video[1]):
-        places[found.frame == i] = on_plane(T, found.pixels[found.frame == i])
-    long = np.flatnonzero(np.bincount(found.track) >= 8)
+        places[found.frame == i] = on_plane(T, found.rays[found.frame == i])
+    long = np.flatnonzero(np.bincount(found.point) >= 8)
     assert len(long) > 100
-    spread = [np.linalg.norm(np.ptp(places[found.track == track], axis=0)) for track in long]
+    spread = [np.linalg.norm(np.ptp(places[found.point == track], axis=0)) for track in long]
     pixel = 3.0 / CAMERA.fx  # its size on the plane
     assert np.median(spread) < 0.7 * pixel
     assert np.percentile(spread, 90) < 2.0 * pixel
-    keys = found.frame * (found.track.max() + 1) + found.track
+    keys = found.frame * (found.point.max() + 1) + found.point
     assert len(np.unique(keys)) == len(keys), "a track has one place in a frame"
 
 
@@ -144,7 +143,7 @@ def test_adjusted_poses_are_those_of_the_images(video, monkeypatch, few):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("few", "adjusts"), [(5, False), (5, True), (60, True)])
+@pytest.mark.parametrize(("few", "adjusts"), [(5, False), (60, True)])
 def test_held_out_frames_change_nothing_but_their_own(video, tmp_path, monkeypatch, few, adjusts):
     """Whatever they show, the points and the poses of the others are the same bit for bit."""
     monkeypatch.setattr(triangulation, "FEW_FRAMES", few)
@@ -184,6 +183,5 @@ def test_frames_without_any_corner_have_none(tmp_path, video):
     for i in range(4):
         cv2.imwrite(str(tmp_path / f"{i}.png"), np.full((SIZE[1], SIZE[0], 3), 128, np.uint8))
     images, frames = posed((tmp_path, video[1][:4]))
-    found = follow_features(images, frames, np.ones(4, bool))
-    assert len(found.frame) == len(found.pixels) == 0
-    assert len(follow_features(images, frames, np.zeros(4, bool)).frame) == 0
+    for solves in (np.ones(4, bool), np.zeros(4, bool)):
+        assert len(follow_features(images, frames, solves)) == 0
