@@ -24,6 +24,12 @@ def as_yaml(value: Any) -> str:
     return json.dumps(shown_url(value) if isinstance(value, str) else value, ensure_ascii=False, default=str)
 
 
+def described(model: type[BaseModel]) -> str:
+    """Return what a model is, in words that may stand within a sentence: the first line of its docstring."""
+    first = (model.__doc__ or "").partition("\n")[0].removesuffix(".")
+    return first[:1].lower() + first[1:]
+
+
 @dataclass(frozen=True)
 class KeyDoc:
     """Documentation of one setting.
@@ -70,7 +76,7 @@ def documented_keys(
             if not selects and not info.is_required():
                 value = info.get_default(call_default_factory=True, validated_data={})
                 default = "" if value is None else as_yaml(value)
-            description = info.description or ""
+            description = info.description or (described(model) if selects else "")
             yield KeyDoc(prefix + name, _type_name(info.annotation), default, description, variant, selects)
 
 

@@ -21,6 +21,7 @@ from modp_ti.files.file_tree import ARCHIVES
 from modp_ti.files.terminal import require_text
 from modp_ti.files.urls import actual_url, shown_url
 from modp_ti.inputs.opening import is_panoramic, open_source, recognised_kind
+from modp_ti.inputs.reader import kind_of
 from modp_ti.inputs.readers import READERS, SOURCES
 from modp_ti.inputs.sources.image_folder import IMAGE_SUFFIXES, NOT_READ, ImageFolder
 from modp_ti.inputs.sources.listed_images import ListedImages
@@ -121,19 +122,19 @@ def recorded_scene(
         scene = _scene({"path": str(images)}, output, tracker)
         return scene_from_data(scene, str(path), [*overrides, *more], preset)
 
-    kinds = IN_FOLDERS if kind == "images" else [SOURCES[kind].model_fields["kind"].default] if kind in SOURCES else []
-    found = next(((each, *poses) for each in kinds if (poses := READERS[each].poses_of(path)) is not None), None)
-    if found is not None and found[2] == path:  # the recording itself brings them
-        return settings({"kind": found[0], **found[1]})
+    kinds = IN_FOLDERS if kind == "images" else [kind_of(SOURCES[kind])] if kind in SOURCES else []
+    found = ((each, poses) for each in kinds if (poses := READERS[each].poses_of(path)) is not None)
+    tracker, poses = next(found, ("", path))
+    if tracker and poses == path:  # the recording itself brings them
+        return settings({"kind": tracker})
     config = settings({"kind": "klt"})
     if any(override.strip().startswith("tracker.") for override in overrides):
         return config
-    if found is not None:
-        tracker, given, file = found
-        if tracker != "tum" or config.source.intrinsics.given or _is_calibrated(config):
-            say(f"the poses of {file} are used; tracker.kind=klt would track the images alone")
-            return settings({"kind": tracker, **given})
-        say(f"{file} is not used without source.intrinsics (tracker.kind=tum): klt tracks the images")
+    if tracker and (tracker != "tum" or config.source.intrinsics.given or _is_calibrated(config)):
+        say(f"the poses of {poses} are used; tracker.kind=klt would track the images alone")
+        return settings({"kind": tracker, "path": str(poses)})
+    if tracker:
+        say(f"{poses} is not used without source.intrinsics (tracker.kind=tum): klt tracks the images")
     if kind == "images" and not config.source.panorama.model_fields_set:
         first = ImageFolder(images).names[:1]
         with suppress(UnreadableImageError):

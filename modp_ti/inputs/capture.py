@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import io
 import math
-from array import array
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
+from pathlib import PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -14,9 +15,9 @@ from numpy.typing import NDArray
 
 from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import inverse_se3
-from modp_ti.files import LARGEST, limited_lines, reading
+from modp_ti.files import LARGEST, reading
 from modp_ti.files.errors import InputError
-from modp_ti.files.file_tree import FileTree
+from modp_ti.files.file_tree import SETTING, FileTree
 from modp_ti.files.trajectory import checked_pose
 from modp_ti.inputs.sources.distortion import NO_DISTORTION, Distortion
 from modp_ti.inputs.sources.image_header import read_image_header
@@ -89,35 +90,36 @@ class Capture:
     read_depth: Callable[[FileTree, CapturedFrame], DepthMap] | None = None
 
 
-def opencv_pose(matrix: Any, where: str) -> NDArray[np.float64]:
-    """Return T_camera_world (4, 4) of a matrix (4, 4) or (3, 4), camera to world with OpenCV axes.
+def rigid_motion(matrix: Any, where: str) -> NDArray[np.float64]:
+    """Return a rigid motion (4, 4) that a file states, with the nearest rotation.
 
     Args:
-        matrix: The numbers, nested or in one row-major list.
+        matrix: The numbers of a matrix (4, 4) or (3, 4), nested or in one row-major list.
         where: Start of the error message, such as file and line.
 
     Raises:
-        InputError: If it is no rigid motion.
+        InputError: If it is none.
     """
-    return inverse_se3(_camera_to_world(matrix, where))
-
-
-def opengl_pose(matrix: Any, where: str) -> NDArray[np.float64]:
-    """Return T_camera_world (4, 4) of a matrix, camera to world with OpenGL axes; see `opencv_pose`."""
-    return inverse_se3(_camera_to_world(matrix, where) @ OPENCV_OPENGL)
-
-
-def _camera_to_world(matrix: Any, where: str) -> NDArray[np.float64]:
     try:
         numbers = np.array(matrix, dtype=np.float64)
     except (ValueError, TypeError, OverflowError):
         numbers = np.zeros(0)
     if numbers.size not in (12, 16):
-        raise InputError(f"{where}: the pose must be 12 or 16 numbers, camera to world")
+        raise InputError(f"{where}: the pose must be 12 or 16 numbers: 3 or 4 rows of a 4x4 matrix")
     numbers = numbers.reshape(-1, 4)
     if len(numbers) == 3:
         numbers = np.vstack([numbers, [0.0, 0.0, 0.0, 1.0]])
     return checked_pose(numbers, where)
+
+
+def opencv_pose(matrix: Any, where: str) -> NDArray[np.float64]:
+    """Return T_camera_world (4, 4) of a matrix, camera to world with OpenCV axes; see `rigid_motion`."""
+    return inverse_se3(rigid_motion(matrix, where))
+
+
+def opengl_pose(matrix: Any, where: str) -> NDArray[np.float64]:
+    """Return T_camera_world (4, 4) of a matrix, camera to world with OpenGL axes; see `rigid_motion`."""
+    return inverse_se3(rigid_motion(matrix, where) @ OPENCV_OPENGL)
 
 
 def checked_numbers(values: Any, count: int, where: str) -> list[float]:
@@ -160,13 +162,18 @@ def depth_files(tree: FileTree, depth: str, confidence: str) -> tuple[str | None
     return depth, confidence if tree.has(confidence) else None
 
 
-def picture_size(tree: FileTree, name: str) -> tuple[int, int] | None:
-    """Return the size (width, height) of a picture by its header; None if it cannot be read."""
-    try:
-        header = read_image_header(io.BytesIO(tree.read(name)))
-    except OSError:
-        return None
-    return None if header is None else (header.width, header.height)
+def size_of_pictures(tree: FileTree, names: Iterable[str]) -> tuple[int, int]:
+    """Return the size (width, height) of the first picture whose header can be read.
+
+    Raises:
+        InputError: If there is none.
+    """
+    for name in names:
+        with suppress(OSError):
+            header = read_image_header(io.BytesIO(tree.read(name)))
+            if header is not None:
+                return header.width, header.height
+    raise InputError(f"{tree.path}: holds no picture that can be read; copy it again")
 
 
 def read_lines(tree: FileTree, name: str) -> list[tuple[int, str]]:
@@ -175,15 +182,12 @@ def read_lines(tree: FileTree, name: str) -> list[tuple[int, str]]:
     Raises:
         InputError: If it cannot be read.
     """
-    with reading(tree.path / name, " (source.path)"):
-        text = io.StringIO(tree.read_text(name))
-        numbered = enumerate((line.partition("#")[0].strip() for line in limited_lines(text)), 1)
-        return [(number, line) for number, line in numbered if line]
+    with reading(tree.path / name, SETTING):
+        lines = enumerate((line.partition("#")[0].strip() for line in tree.read_text(name).splitlines()), 1)
+    return [(number, line) for number, line in lines if line]
 
 
-def read_numbers(
-    tree: FileTree, name: str, columns: int, meaning: str, finite: bool = True
-) -> tuple[NDArray[np.float64], list[int]]:
+def read_numbers(tree: FileTree, name: str, columns: int, meaning: str, finite: bool = True) -> NDArray[np.float64]:
     """Read rows of at least `columns` numbers, separated by blanks or commas. Further columns are ignored.
 
     Args:
@@ -194,26 +198,43 @@ def read_numbers(
         finite: Whether NaN and infinite numbers are errors.
 
     Returns:
-        The rows (N, columns), and the line of each.
+        The rows (N, columns).
 
     Raises:
-        InputError: With file and line, if a row has too few columns, text or numbers beyond `LARGEST`; also if the
-            file cannot be read or has no rows.
+        InputError: If the file cannot be read or has no rows; with the line, if a row has too few columns, text or
+            numbers beyond `LARGEST`.
     """
-    values, lines = array("d"), []
+    rows = []
     for number, line in read_lines(tree, name):
-        where = f"{tree.path / name}:{number}"
-        words = line.replace(",", " ").split()[:columns]
         try:
-            row = [float(word) for word in words]
+            row = [float(word) for word in line.replace(",", " ").split()[:columns]]
         except ValueError:
-            raise InputError(f"{where}: not a row of numbers: {meaning}") from None
-        if len(row) < columns:
-            raise InputError(f"{where}: holds {len(row)} columns instead of {columns}: {meaning}")
-        if any(abs(value) > LARGEST if math.isfinite(value) else finite for value in row):
-            raise InputError(f"{where}: holds NaN or a number beyond {LARGEST:g}; the file is damaged")
-        values.extend(row)
-        lines.append(number)
-    if not lines:
+            row = []
+        if len(row) < columns or any(abs(v) > LARGEST if math.isfinite(v) else finite for v in row):
+            raise InputError(f"{tree.path / name}:{number}: is no row of {columns} finite numbers: {meaning}")
+        rows.append(row)
+    if not rows:
         raise InputError(f"{tree.path / name}: holds no row of {meaning}")
-    return np.frombuffer(values).reshape(-1, columns), lines
+    return np.array(rows)
+
+
+def read_object(tree: FileTree, name: str, key: str) -> dict[str, Any]:
+    """Read a JSON file that holds an object with this key.
+
+    Raises:
+        InputError: If it is missing or holds something else.
+    """
+    data = tree.read_json(name)
+    if not isinstance(data, dict) or key not in data:
+        raise InputError(f"{tree.path / name}: holds no `{key}`; the file is damaged, or of another program")
+    return data
+
+
+def numbered(tree: FileTree, folder: str, suffixes: tuple[str, ...]) -> dict[int, str]:
+    """Return the names of the files in a folder that are called by a number, in its order."""
+    found = {}
+    for name in tree.listed(folder):
+        path = PurePosixPath(name)
+        if path.stem.isascii() and path.stem.isdecimal() and path.suffix.lower() in suffixes and len(path.stem) < 19:
+            found.setdefault(int(path.stem), name)
+    return dict(sorted(found.items()))

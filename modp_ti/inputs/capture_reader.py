@@ -7,38 +7,37 @@ from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, ClassVar
+from typing import TYPE_CHECKING, BinaryIO, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from fields.frames.tracked_frame import SparsePoints
+from modp_ti.config.keys import described
+from modp_ti.files import reading
 from modp_ti.files.errors import FEW, InputError
-from modp_ti.files.file_tree import FileTree, open_tree
+from modp_ti.files.file_tree import SETTING, FileTree, open_tree
 from modp_ti.inputs.capture import Capture, CapturedFrame
 from modp_ti.inputs.depth_maps import depth_points
-from modp_ti.inputs.given_poses import checked_reader, missing_frames_note, selected_frames, solving
-from modp_ti.inputs.multiview.triangulation import adjusted_frames, triangulated_frames
-from modp_ti.inputs.opening import open_source
-from modp_ti.inputs.protocol import Progress
-from modp_ti.inputs.reader import TrackerSettings
-from modp_ti.inputs.replay import PosedImage, ReplayedTracker
+from modp_ti.inputs.posed_recording import PosedRecording, StoredView
+from modp_ti.inputs.protocol import Progress, Tracker
+from modp_ti.inputs.reader import PosesSettings, kind_of
 from modp_ti.inputs.sources.intrinsics import Intrinsics
 from modp_ti.inputs.sources.listed_images import ListedImages
 from modp_ti.inputs.sources.orientation import Turn
 from modp_ti.inputs.sources.protocol import ImageSource
 from modp_ti.inputs.sources.undistortion import both_valid
 from modp_ti.inputs.sources.video_file import VideoFile
-from modp_ti.inputs.stored_cameras import StoredView, stored_frames
 
 if TYPE_CHECKING:
     from modp_ti.config.settings import SceneConfig, SourceSettings
 
 
-class CaptureSettings(TrackerSettings):
+class CaptureSettings(PosesSettings):
     """Base class for captures, whose cameras and poses come with the images of `source.path`.
 
-    A kind defines `source_kind`, `holds`, `recognises` and `read`.
+    A kind defines `holds`, `recognises` and `read`.
     """
 
     brings_cameras: ClassVar[bool] = True
@@ -61,8 +60,8 @@ class CaptureSettings(TrackerSettings):
         """
 
     @classmethod
-    def poses_of(cls, path: Path) -> tuple[dict[str, Any], Path] | None:
-        return {}, path
+    def poses_of(cls, path: Path) -> Path | None:
+        return path
 
     @classmethod
     def open_images(cls, path: Path, source: SourceSettings) -> ImageSource:
@@ -92,55 +91,45 @@ class CaptureSettings(TrackerSettings):
         images.intrinsics = Intrinsics(frames[0].camera, first.lens)
         return images
 
-    def open(self, scene: SceneConfig, progress: Progress | None = None) -> ReplayedTracker:
-        """Open the images of a capture that have a pose, each with its own camera.
-
-        Points are triangulated before the first frame is delivered.
-        """
+    def open(self, scene: SceneConfig, progress: Progress | None = None) -> Tracker:
+        """Open the images of a capture that have a pose, each with its own camera."""
         source = scene.source
-        if source.kind not in ("auto", self.source_kind):
+        if source.kind not in ("auto", self.kind):
             raise InputError(
                 f"{source.path}: source.kind: {source.kind} has no poses of tracker.kind: {self.kind}: leave "
                 "source.kind out"
             )
-        source = source.model_copy(update={"kind": self.source_kind})
-        images = open_source(source)
-        capture = images.capture
-        assert capture is not None
+        source = source.model_copy(update={"kind": self.kind})
+        return super().open(scene.model_copy(update={"source": source}), progress)
+
+    def add_poses(self, recording: PosedRecording) -> None:
+        """Give images their cameras and poses. Points are those of the depth maps, or are triangulated."""
+        capture = recording.images.capture
+        assert capture is not None, "it opens captures"
         origin = str(capture.tree.path / capture.origin)
-        selected = selected_frames(images, source)
         found = {frame.image: frame for frame in capture.frames}
-        views = {
-            name: StoredView(frame.camera, frame.lens, frame.T_camera_world)
-            for name in selected
+        posed = {
+            name: (frame, StoredView(frame.camera, frame.lens, frame.T_camera_world))
+            for name in recording.selected
             if (frame := found.get(name)) is not None and frame.T_camera_world is not None
         }
-        if not views:
+        if not posed:
             raise InputError(
-                f"{origin}: has no pose for any of the {len(selected)} frames that are selected, or is missing: "
-                "tracker.kind=klt tracks the images alone"
+                f"{origin}: has no pose for any of the selected frames, or is missing: tracker.kind=klt tracks the "
+                "images alone"
             )
-        frames, turns, notes = stored_frames(images, views, origin)
-        notes = [*missing_frames_note(selected, views, capture.origin), *notes]
-        reader = checked_reader(images, source, {frame.name: frame.undistorter for frame in frames}, origin)
+        recording.note_missing(posed, capture.origin)
+        turns = recording.pose_stored({name: view for name, (_, view) in posed.items()}, origin)
         if self.adjust:
-            frames, note = adjusted_frames(images, frames, solving(frames, source), progress)
-            return ReplayedTracker(reader, frames, [*notes, note])
-        frames, more = self._with_depths(capture, [found[name] for name in views], turns, frames, progress)
-        if not any(len(frame.points) for frame in frames):
-            frames = triangulated_frames(images, frames, solving(frames, source), progress)
-        return ReplayedTracker(reader, frames, [*notes, *more])
+            recording.adjust()
+        elif not self._gives_depths(recording, capture, [frame for frame, _ in posed.values()], turns):
+            recording.triangulate()
 
-    def _with_depths(
-        self,
-        capture: Capture,
-        captured: Sequence[CapturedFrame],
-        turns: Sequence[Turn],
-        frames: list[PosedImage],
-        progress: Progress | None,
-    ) -> tuple[list[PosedImage], list[str]]:
-        """Return the frames with points of their depth maps, where there are some, and remarks for the user."""
-        return frames, []
+    def _gives_depths(
+        self, recording: PosedRecording, capture: Capture, captured: Sequence[CapturedFrame], turns: Sequence[Turn]
+    ) -> bool:
+        """Give the frames points of their depth maps. Returns whether any frame has one."""
+        return False
 
 
 class DepthCaptureSettings(CaptureSettings):
@@ -154,19 +143,15 @@ class DepthCaptureSettings(CaptureSettings):
     max_points: int = Field(default=400, ge=10, description="largest number of points of a frame from its depth map")
     max_depth: float = Field(default=5.0, gt=0, description="largest depth [m] that is used")
 
-    def _with_depths(
-        self,
-        capture: Capture,
-        captured: Sequence[CapturedFrame],
-        turns: Sequence[Turn],
-        frames: list[PosedImage],
-        progress: Progress | None,
-    ) -> tuple[list[PosedImage], list[str]]:
+    def _gives_depths(
+        self, recording: PosedRecording, capture: Capture, captured: Sequence[CapturedFrame], turns: Sequence[Turn]
+    ) -> bool:
         """Damaged maps are left out, up to a share `FEW` of them."""
         if not self.depth or capture.read_depth is None:
-            return frames, []
-        result, damaged = list(frames), []
-        for index, (stored, turn, frame) in enumerate(zip(captured, turns, frames, strict=True)):
+            return False
+        points, damaged = [], []
+        for index, (stored, turn, frame) in enumerate(zip(captured, turns, recording.frames, strict=True)):
+            points.append(SparsePoints())
             if stored.depth is None:
                 continue
             try:
@@ -174,14 +159,13 @@ class DepthCaptureSettings(CaptureSettings):
             except OSError as error:
                 damaged.append(f"{capture.tree.path / stored.depth}: unreadable depth map: {error.strerror}")
                 continue
-            points = depth_points(depth, stored, turn, frame, index, self.max_points, self.max_depth)
-            result[index] = frame.with_points(points)
-            if progress is not None:
-                progress("reading depths", index + 1, len(frames))
-        if len(damaged) > FEW * len(frames):
+            points[-1] = depth_points(depth, stored, turn, frame, index, self.max_points, self.max_depth)
+        if len(damaged) > FEW * len(points):
             raise InputError(f"{damaged[0]}; copy the capture again, or set tracker.depth: false")
-        lost = f"{len(damaged)} depth maps are damaged: left out (the first: {damaged[0]})" if damaged else ""
-        return result, [lost] if lost else []
+        if damaged:
+            recording.notes.append(f"{len(damaged)} depth maps are damaged: left out (the first: {damaged[0]})")
+        given = iter(points)
+        return recording.add_points(lambda _: next(given))
 
 
 def _capture(reader: type[CaptureSettings], path: Path) -> Capture:
@@ -192,10 +176,10 @@ def _capture(reader: type[CaptureSettings], path: Path) -> Capture:
     tree = next((tree for tree in trees if reader.recognises(tree)), None)
     try:
         if tree is None:
-            raise InputError(
-                f"{path}: is no capture of kind {reader.source_kind}, which holds {reader.holds} (source.path)"
-            )
-        return reader.read(tree)
+            raise InputError(f"{path}: is no capture of kind {kind_of(reader)}, which holds {reader.holds}{SETTING}")
+        with reading(tree.path, SETTING):
+            capture = reader.read(tree)
+        return replace(capture, notes=[f"{tree.path}: is {described(reader)}", *capture.notes])
     except InputError:
         trees[0].close()
         raise

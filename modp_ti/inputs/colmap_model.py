@@ -29,6 +29,7 @@ OBSERVATION = np.dtype([("pixel", "<f8", 2), ("point", "<i8")])
 # Longest line of a text model [characters]. All observations of an image are in one line.
 MAX_TEXT_LINE = 1 << 24
 MAX_LENGTH_ERROR = 0.1  # of a quaternion
+AGAIN = "; copy or export the COLMAP model again"
 
 
 @dataclass(frozen=True)
@@ -102,19 +103,23 @@ def read_colmap_model(folder: Path, posed_alone: bool = False) -> ColmapModel:
         raise InputError(f"{folder}: the COLMAP model lacks {', '.join(missing) or 'files of one format'}")
     readers = (_cameras, _images, _points) if there[0] == ".bin" else (_text_cameras, _text_images, _text_points)
     files = [folder / f"{stem}{there[0]}" for stem in STEMS]
-    cameras, images = dict(readers[0](files[0])), dict(readers[1](files[1]))
+    with reading(files[0], AGAIN):
+        cameras = dict(readers[0](files[0]))
+    with reading(files[1], AGAIN):
+        images = dict(readers[1](files[1]))
     points, observers = {}, set[int]()
-    for number, xyz, track in readers[2](files[2]) if whole else ():
-        points[number] = xyz
-        observers.update(track)
+    with reading(files[2], AGAIN):
+        for number, xyz, track in readers[2](files[2]) if whole else ():
+            points[number] = xyz
+            observers.update(track)
     ids = np.array(sorted(points), dtype=np.int64)
     for image in images.values():
         if image.camera not in cameras:
-            raise InputError(f"{files[0]}: lacks camera {image.camera} of image {image.name}; export the model again")
+            raise InputError(f"{files[0]}: lacks camera {image.camera} of image {image.name}{AGAIN}")
         if not np.isin(image.ids, ids).all() and whole:
-            raise InputError(f"{files[2]}: is incomplete: image {image.name} observes points that it lacks")
+            raise InputError(f"{files[2]}: is incomplete: image {image.name} observes points that it lacks{AGAIN}")
     if observers - images.keys() and any(len(image.ids) for image in images.values()):
-        raise InputError(f"{files[1]}: is incomplete: it lacks images that observe points; export the model again")
+        raise InputError(f"{files[1]}: is incomplete: it lacks images that observe points{AGAIN}")
     return ColmapModel(cameras, images, ids, np.array([points[i] for i in ids.tolist()]).reshape(-1, 3))
 
 
@@ -124,17 +129,17 @@ def image_count(folder: Path) -> int:
         if (folder / "images.bin").exists():
             return _Cursor(folder / "images.bin").read("<Q")[0]
         return sum(1 for _ in _text_images(folder / "images.txt"))
-    except InputError:
+    except (InputError, ValueError, IndexError):
         return 0
 
 
 def _image(
-    what: str, pose: tuple[float, ...], camera: int, name: str, pixels: NDArray[np.float64], ids: NDArray[np.int64]
+    pose: Sequence[float], camera: int, name: str, pixels: NDArray[np.float64], ids: NDArray[np.int64]
 ) -> ModelImage:
     """Return the image with this pose, a quaternion and a translation. Observations of no point are left out."""
     length = math.hypot(*pose[:4])
     if not abs(length - 1.0) < MAX_LENGTH_ERROR:
-        raise InputError(f"{what}: the quaternion of {name} has length {length:.4g} instead of 1; the file is damaged")
+        raise ValueError(f"the quaternion of {name} has length {length:.4g} instead of 1")
     T_camera_world = np.eye(4)
     T_camera_world[:3, :3] = matrices_from_unit_quaternions(np.array(pose[:4]))
     T_camera_world[:3, 3] = pose[4:]
@@ -146,8 +151,7 @@ class _Cursor:
     """A position in a file. Moving it beyond the end raises InputError."""
 
     def __init__(self, file: Path) -> None:
-        with reading(file):
-            self.data = read_bytes(file)
+        self.data = read_bytes(file)
         self.file = file
         self.at = 0
 
@@ -155,7 +159,7 @@ class _Cursor:
         """Move on by so many bytes, and return the position before."""
         before, self.at = self.at, self.at + size
         if self.at > len(self.data):
-            raise InputError(f"{self.file}: the file is cut off; copy or export the COLMAP model again")
+            raise InputError(f"{self.file}: the file is cut off{AGAIN}")
         return before
 
     def read(self, form: str) -> tuple[Any, ...]:
@@ -165,7 +169,7 @@ class _Cursor:
         """Yield the numbers of the records. The file must end where they end."""
         yield from range(self.read("<Q")[0])
         if self.at != len(self.data):
-            raise InputError(f"{self.file}: {len(self.data) - self.at} bytes too long; export the COLMAP model again")
+            raise InputError(f"{self.file}: {len(self.data) - self.at} bytes too long{AGAIN}")
 
 
 def _cameras(file: Path) -> Iterator[tuple[int, ModelCamera]]:
@@ -184,14 +188,10 @@ def _images(file: Path) -> Iterator[tuple[int, ModelImage]]:
         number, *pose, camera = cursor.read("<I7dI")
         end = cursor.data.find(b"\0", cursor.at)  # of the name
         start = cursor.skip((len(cursor.data) if end < 0 else end) + 1 - cursor.at)
-        try:
-            name = cursor.data[start:end].decode()
-        except UnicodeDecodeError:
-            raise InputError(f"{file}: the name of image {number} is not UTF-8: export the model again") from None
+        name = cursor.data[start:end].decode()
         (count,) = cursor.read("<Q")
-        start = cursor.skip(count * OBSERVATION.itemsize)
-        seen = np.frombuffer(cursor.data, OBSERVATION, count, start)
-        yield number, _image(str(file), tuple(pose), camera, name, seen["pixel"], seen["point"])
+        seen = np.frombuffer(cursor.data, OBSERVATION, count, cursor.skip(count * OBSERVATION.itemsize))
+        yield number, _image(pose, camera, name, seen["pixel"], seen["point"])
 
 
 def _points(file: Path) -> Iterator[tuple[int, tuple[float, ...], Sequence[int]]]:
@@ -203,18 +203,12 @@ def _points(file: Path) -> Iterator[tuple[int, tuple[float, ...], Sequence[int]]
 
 
 def _text_cameras(file: Path) -> Iterator[tuple[int, ModelCamera]]:
-    parameters = dict(CAMERA_MODELS)
-    for number, line in _lines(file):
-        words = line.split()
-        try:
-            camera = ModelCamera(words[1], int(words[2]), int(words[3]), tuple(map(float, words[4:])))
-            if len(camera.params) != parameters.get(camera.model, len(camera.params)):
-                raise ValueError
-            yield int(words[0]), camera
-        except (ValueError, IndexError):
-            raise InputError(
-                f"{file}:{number}: no line of a camera (id model width height parameters); the file is damaged"
-            ) from None
+    for line in _lines(file):
+        number, model, width, height, *params = line.split()
+        camera = ModelCamera(model, int(width), int(height), tuple(map(float, params)))
+        if len(params) != dict(CAMERA_MODELS).get(model, len(params)):
+            raise InputError(f"{file}: camera {number} has {len(params)} parameters, which {model} has not{AGAIN}")
+        yield int(number), camera
 
 
 def _text_images(file: Path) -> Iterator[tuple[int, ModelImage]]:
@@ -222,19 +216,11 @@ def _text_images(file: Path) -> Iterator[tuple[int, ModelImage]]:
     lines = list(_lines(file))
     at = 0
     while at < len(lines):
-        number, line = lines[at]
-        words = line.split(maxsplit=9)
-        observed = _observations(lines[at + 1][1]) if at + 1 < len(lines) else None
+        number, *pose, camera, name = lines[at].split(maxsplit=9)
+        observed = _observations(lines[at + 1]) if at + 1 < len(lines) else None
         at += 1 if observed is None else 2
         rows = np.zeros((0, 3)) if observed is None else observed
-        try:
-            pose = tuple(map(float, words[1:8]))
-            content = int(words[0]), (pose, int(words[8]), words[9], rows[:, :2], rows[:, 2].astype(np.int64))
-        except (ValueError, IndexError):
-            raise InputError(
-                f"{file}:{number}: no line of an image (id qw qx qy qz tx ty tz camera name); the file is damaged"
-            ) from None
-        yield content[0], _image(f"{file}:{number}", *content[1])
+        yield int(number), _image([*map(float, pose)], int(camera), name, rows[:, :2], rows[:, 2].astype(np.int64))
 
 
 def _observations(line: str) -> NDArray[np.float64] | None:
@@ -246,19 +232,13 @@ def _observations(line: str) -> NDArray[np.float64] | None:
 
 
 def _text_points(file: Path) -> Iterator[tuple[int, tuple[float, ...], Sequence[int]]]:
-    for number, line in _lines(file):
-        words = line.split(maxsplit=8)
-        try:
-            track = words[8].split()[::2] if len(words) > 8 else []
-            yield int(words[0]), tuple(map(float, (words[1], words[2], words[3], words[7])))[:3], list(map(int, track))
-        except (ValueError, IndexError):
-            raise InputError(
-                f"{file}:{number}: no line of a point (id x y z r g b error); export the model again"
-            ) from None
+    for line in _lines(file):
+        number, x, y, z, _, _, _, _, *track = line.split()
+        yield int(number), (float(x), float(y), float(z)), [*map(int, track[::2])]
 
 
-def _lines(file: Path) -> Iterator[tuple[int, str]]:
-    """Yield number and content of the lines of a text file that are neither blank nor comments."""
-    for number, line in enumerate(input_lines(file, "; export the COLMAP model again", MAX_TEXT_LINE), 1):
+def _lines(file: Path) -> Iterator[str]:
+    """Yield the lines of a text file that are neither blank nor comments."""
+    for line in input_lines(file, AGAIN, MAX_TEXT_LINE):
         if (line := line.strip()) and not line.startswith("#"):
-            yield number, line
+            yield line

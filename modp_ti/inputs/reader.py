@@ -3,26 +3,32 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from modp_ti.files.errors import InputError
 from modp_ti.files.file_tree import FileTree
+from modp_ti.inputs.point_cloud import read_point_file, spread_points
+from modp_ti.inputs.posed_recording import PosedRecording
+from modp_ti.inputs.protocol import Progress, Tracker
+from modp_ti.inputs.timed_poses import on_the_clock_of, read_trajectory_file
 from pipelines.settings import StrictModel
 
 if TYPE_CHECKING:
     from modp_ti.config.settings import SceneConfig, SourceSettings
-    from modp_ti.inputs.protocol import Progress, Tracker
     from modp_ti.inputs.sources import ImageSource
 
 
 class TrackerSettings(StrictModel):
     """Base class of readers: the `tracker` section of a scene, with what other sections depend on, and its reading.
 
-    A kind whose poses belong to recordings of one layout reads the images of these too: it sets `source_kind`, and
-    defines `recognises` and `open_images`.
+    The docstring of a kind is its description in the reference of settings. A kind whose poses belong to recordings of
+    one layout reads the images of these too: it defines `recognises` and `open_images`.
     """
 
     # Each kind narrows it to one literal. Declared here so that it is the first key in `config.yaml` and in the docs.
@@ -39,7 +45,7 @@ class TrackerSettings(StrictModel):
     places_panoramas: ClassVar[bool] = False
     """Whether the tracker has poses of images that see all round, which `source.panorama` cuts into faces."""
     source_kind: ClassVar[str] = ""
-    """The `source.kind` of the recordings whose images this kind reads; empty if it reads none."""
+    """The `source.kind` of the recordings whose images this kind reads, if it is another name than `kind`."""
     file_suffixes: ClassVar[Sequence[str]] = ()
     """Suffixes of the files that are such recordings, whatever they hold."""
     pose_files: ClassVar[Sequence[str]] = ()
@@ -51,12 +57,12 @@ class TrackerSettings(StrictModel):
 
     @classmethod
     def recognises(cls, tree: FileTree) -> bool:
-        """Whether a folder or archive is a recording of `source_kind`. It must be cheap: it lists files at most."""
+        """Whether a folder or archive is such a recording. It must be cheap: it lists files at most."""
         return False
 
     @classmethod
     def open_images(cls, path: Path, source: SourceSettings) -> ImageSource:
-        """Open the images of a recording of `source_kind`.
+        """Open the images of such a recording.
 
         Args:
             path: The file or folder.
@@ -68,20 +74,72 @@ class TrackerSettings(StrictModel):
         raise NotImplementedError
 
     @classmethod
-    def poses_of(cls, path: Path) -> tuple[dict[str, Any], Path] | None:
-        """Return the settings that read the poses of a recording or of a folder of images, and their file.
+    def poses_of(cls, path: Path) -> Path | None:
+        """Return what `path` of this kind is for a recording or a folder of images; the path itself if they are in it.
 
         None if it has no poses of this kind.
         """
-        file = next((file for pattern in cls.pose_files for file in path.glob(pattern)), None)
-        return None if file is None else ({"path": str(file)}, file)
+        return next((file for pattern in cls.pose_files for file in path.glob(pattern)), None)
 
 
-class RecordedSettings(TrackerSettings):
-    """Base class for trackers that read the results of earlier tracking from files."""
+def kind_of(reader: type[TrackerSettings]) -> str:
+    """Return the `tracker.kind` of a reader."""
+    return reader.model_fields["kind"].default
+
+
+class PosesSettings(TrackerSettings):
+    """Base class for trackers that read the results of earlier tracking, all at once."""
+
+    def open(self, scene: SceneConfig, progress: Progress | None = None) -> Tracker:
+        """Open the images, and give them the poses and points of `add_poses`."""
+        recording = PosedRecording(scene.source, progress)
+        try:
+            self.add_poses(recording)
+        except InputError:
+            recording.images.close()
+            raise
+        return recording.tracker()
+
+    @abstractmethod
+    def add_poses(self, recording: PosedRecording) -> None:
+        """Give the images of a recording their poses and points. Images without a pose are skipped.
+
+        Raises:
+            InputError: If a file is missing or malformed, or does not belong to the images.
+        """
+
+
+class RecordedSettings(PosesSettings):
+    """Base class for trackers with a file of poses."""
 
     # Each kind describes its file and the default places in its own `description`.
     path: Path | None = None
+
+    def found(self, source: SourceSettings, names: Sequence[str], what: str) -> Path:
+        """Return the file `path`, or the first of some names in this folder or, if it is empty, near the images.
+
+        Args:
+            source: Settings of the images, in or next to whose folder the file may lie.
+            names: Names of the file or patterns of them, in the order of preference.
+            what: Description of the file, for error messages.
+
+        Raises:
+            InputError: If there is no such file, or there are several by one pattern.
+        """
+        place = source.require_path()
+        if self.path is not None and not self.path.is_dir():
+            if not self.path.is_file():
+                raise InputError(f"{self.path}: no such file (tracker.path); it should be {what}")
+            return self.path
+        folders = [place, place.parent] if self.path is None else [self.path]
+        for name in names:
+            for folder in folders:
+                found = sorted(file for file in folder.glob(name) if file.is_file())
+                if len(found) > 1:
+                    raise InputError(f"{folder}: holds {len(found)} files {name}: name one of them in tracker.path")
+                if found:
+                    return found[0]
+        raise InputError(f"no {', '.join(names)} in {' or '.join(map(str, folders))}: set tracker.path to {what}")
 
 
 class TimedPosesSettings(RecordedSettings):
@@ -93,6 +151,40 @@ class TimedPosesSettings(RecordedSettings):
     time_offset: float = Field(
         default=0.0, description="offset [s] added to the times of the poses, if their clock differs from the images'"
     )
+
+    def rows_at_frames(self, recording: PosedRecording, path: Path, times: NDArray[np.float64]) -> dict[str, int]:
+        """Associate the selected images with poses by time.
+
+        An image and a pose may differ by at most `max_difference`. Each is used once; the pairs nearest in time are
+        matched first.
+
+        Args:
+            recording: The images.
+            path: Origin of the poses, for messages.
+            times: Times (N,) of the poses [s], before `time_offset` is added.
+
+        Returns:
+            The row of the pose of each matched image, by name in the source's order.
+
+        Raises:
+            InputError: If no image has a pose.
+        """
+        names, whole = recording.selected, recording.images.whole
+        of_frames = np.array([whole.timestamp(name) for name in names])
+        every = np.array([whole.timestamp(name) for name in whole.names])
+        shifted, pairs, remark = on_the_clock_of(
+            of_frames, every, times, self.time_offset, self.max_difference, str(path)
+        )
+        if len(pairs) == 0:
+            raise InputError(
+                f"{path}: no pose lies within {self.max_difference:g} s of a frame: its times run from "
+                f"{shifted[0]:.6f} to {shifted[-1]:.6f} s, those of the frames from {of_frames.min():.6f} to "
+                f"{of_frames.max():.6f} s; check source.fps, tracker.time_offset and tracker.max_difference"
+            )
+        rows = {str(names[int(frame)]): int(row) for frame, row in pairs}
+        recording.notes += [f"the times of {path.name} {remark}"] if remark else []
+        recording.note_missing(rows, path.name)
+        return rows
 
 
 class GivenPosesSettings(RecordedSettings):
@@ -125,8 +217,78 @@ class GivenPosesSettings(RecordedSettings):
             raise ValueError("tracker.adjust cannot be used with tracker.points; remove one of them")
         return self
 
+    def give(self, recording: PosedRecording, poses: Mapping[str, NDArray[np.float64]]) -> None:
+        """Set poses, and the points of the settings.
+
+        With `points`, each frame gets the points of that file that project into it. Otherwise features are tracked and
+        triangulated with the poses, and with `adjust` the poses are bundle adjusted together with these points.
+
+        Args:
+            recording: The images.
+            poses: T_camera_world (4, 4) by image name, in the source's order.
+
+        Raises:
+            InputError: As for `PosedRecording.pose`, or if the point file is invalid.
+        """
+        recording.pose(poses)
+        if self.points is not None:
+            xyz, limit = read_point_file(self.points), self.max_points
+            numbers = np.arange(len(xyz))
+            if not recording.add_points(lambda frame: spread_points(xyz, numbers, frame, limit)):
+                raise InputError(
+                    f"{self.points}: none of its {len(xyz)} points is seen by any of the {len(recording.frames)} "
+                    "frames: points and poses must be of one world, poses camera to world (tracker.points)"
+                )
+        elif self.adjusts:
+            recording.adjust()
+        else:
+            recording.triangulate()
+
+    def give_by_number(
+        self,
+        recording: PosedRecording,
+        file: Path,
+        poses: Mapping[int, NDArray[np.float64]],
+        number: Callable[[str], int] | None = None,
+    ) -> None:
+        """Set the poses of images by their numbers, as `give` does.
+
+        Args:
+            recording: The images.
+            file: Origin of the poses.
+            poses: T_camera_world (4, 4) by number.
+            number: Returns the number of an image by its name; None for its position in the source, from 0.
+
+        Raises:
+            InputError: If no selected image has a pose, or as for `give`.
+        """
+        numbers = {name: (number or recording.images.whole.position)(name) for name in recording.selected}
+        posed = {name: poses[n] for name, n in numbers.items() if n in poses}
+        recording.note_missing(posed, file.name)
+        most, there = max(poses), len(recording.images.whole)
+        if number is None and most >= there:
+            recording.notes.append(
+                f"{file.name} has poses of {most + 1} images, there are {there}: do they belong together?"
+            )
+        self.give(recording, posed)
+
 
 class TrajectorySettings(TimedPosesSettings, GivenPosesSettings):
     """Base class for trackers whose file is a trajectory in TUM's format."""
 
     places_panoramas: ClassVar[bool] = True
+
+    def give_trajectory(self, recording: PosedRecording, file: Path) -> None:
+        """Set the poses of a trajectory in TUM's format, as `give` does.
+
+        Raises:
+            InputError: If it is malformed, its times do not match the images, or as for `give`.
+        """
+        trajectory = read_trajectory_file(file)
+        if trajectory.left_out:
+            recording.notes.append(
+                f"{trajectory.left_out} of {trajectory.left_out + len(trajectory.times)} lines of {file.name} hold NaN "
+                "or a time out of order: left out"
+            )
+        rows = self.rows_at_frames(recording, file, trajectory.times)
+        self.give(recording, {name: trajectory.T_camera_world[row] for name, row in rows.items()})

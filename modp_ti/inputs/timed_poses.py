@@ -1,4 +1,4 @@
-"""Trajectories of timed poses, and the images that they belong to by time. Ground truth is one of them."""
+"""Trajectories of timed poses, and the frames that they belong to by time. Ground truth is one of them."""
 
 from __future__ import annotations
 
@@ -6,22 +6,13 @@ from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from modp_ti.files.errors import FEW, InputError
 from modp_ti.files.trajectory import read_tum_rows, tum_poses
-from modp_ti.inputs.given_poses import missing_frames_note, replay_poses, selected_frames
-from modp_ti.inputs.opening import open_source
-from modp_ti.inputs.protocol import Before, Progress
-from modp_ti.inputs.reader import TimedPosesSettings, TrajectorySettings
-from modp_ti.inputs.replay import ReplayedTracker
-from modp_ti.inputs.sources import ImageSource
-
-if TYPE_CHECKING:
-    from modp_ti.config.settings import SourceSettings
+from modp_ti.inputs.protocol import Before
 
 # Units of times that are not seconds. Nanoseconds may have been taken for such from NANOSECONDS_FROM on.
 UNITS = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9, "microseconds since 1970": 1e3}
@@ -106,99 +97,49 @@ def require_rising(times: NDArray[np.float64], where: Callable[[int], str]) -> N
         )
 
 
-def rows_at_frames(
-    images: ImageSource, source: SourceSettings, path: Path, times: NDArray[np.float64], tracker: TimedPosesSettings
-) -> tuple[dict[str, int], list[str]]:
-    """Associate the selected images with poses by time.
+def on_the_clock_of(
+    of_frames: NDArray[np.float64],
+    every: NDArray[np.float64],
+    times: NDArray[np.float64],
+    offset: float,
+    limit: float,
+    path: str,
+) -> tuple[NDArray[np.float64], NDArray[np.int64], str]:
+    """Bring the times of poses to the clock of images, and associate both.
 
-    An image and a pose may differ by at most `tracker.max_difference`. Each is used once; the pairs nearest in time are
-    matched first.
+    Numbers of images and other units than seconds are recognised where far more images have a pose then.
 
     Args:
-        images: The image source.
-        source: Settings of the images.
+        of_frames: Times (F,) of the images [s].
+        every: Times of all images of the recording [s], which numbers of images refer to.
+        times: Times (N,) of the poses.
+        offset: Added to the times of the poses [s].
+        limit: Largest difference of a pair [s].
         path: Origin of the poses, for messages.
-        times: Times (N,) of the poses [s], before `tracker.time_offset` is added.
-        tracker: Settings of the tracker.
 
     Returns:
-        The row of the pose of each matched image, by name in the source's order, and remarks for the user.
+        Times (N,) of the poses [s], pairs (M, 2) of an image and a pose as of `associate`, and a remark if the times
+        are not in seconds.
 
     Raises:
-        InputError: If no image has a pose.
+        InputError: If two units fit equally well.
     """
-    names = selected_frames(images, source)
-    of_frames = np.array([images.whole.timestamp(name) for name in names])
-    shifted, remark = _seconds(images, of_frames, path, times, tracker)
-    pairs = associate(of_frames, shifted, tracker.max_difference)
-    if len(pairs) == 0:
-        raise InputError(
-            f"{path}: no pose lies within {tracker.max_difference:g} s of a frame: its times run from "
-            f"{shifted[0]:.6f} to {shifted[-1]:.6f} s, those of the frames from {of_frames.min():.6f} to "
-            f"{of_frames.max():.6f} s; check source.fps, tracker.time_offset and tracker.max_difference"
-        )
-    rows = {names[int(frame)]: int(pose) for frame, pose in pairs}
-    notes = [f"the times of {path.name} {remark}"] if remark else []
-    return rows, [*notes, *missing_frames_note(names, rows, path.name)]
-
-
-def _seconds(
-    images: ImageSource,
-    of_frames: NDArray[np.float64],
-    path: Path,
-    times: NDArray[np.float64],
-    tracker: TimedPosesSettings,
-) -> tuple[NDArray[np.float64], str]:
-    """Return the times of the poses on the images' clock [s], and a remark if the file does not state seconds.
-
-    Numbers of frames and other units are recognised where far more images have a pose then.
-    """
-
-    def count(seconds: NDArray[np.float64]) -> int:
-        return len(associate(of_frames, seconds + tracker.time_offset, tracker.max_difference))
-
+    readings = {"": times + offset}
+    pairs = {"": associate(of_frames, readings[""], limit)}
     least = 0.5 * min(len(of_frames), len(times))
-    readings = {"": times}
-    if count(times) < least:
-        readings |= {f"are {unit}": times * factor for unit, factor in UNITS.items()}
-        own = np.array([images.whole.timestamp(name) for name in images.whole.names])
-        first = int(times[-1] == len(own) and times[0] > 0)
-        if times[0] >= 0 and times[-1] - first < len(own) and not (times % 1).any():
-            readings[f"count frames from {first}"] = own[times.astype(np.int64) - first]
-    counts = {remark: count(seconds) for remark, seconds in readings.items()}
-    second, best = sorted(counts, key=lambda remark: counts[remark])[-2:] if len(counts) > 1 else ("", "")
-    if counts[best] <= max(2 * counts[""], least):
+    if len(pairs[""]) >= least:
+        return readings[""], pairs[""], ""
+    readings |= {f"are {unit}": times * factor + offset for unit, factor in UNITS.items()}
+    first = int(times[-1] == len(every) and times[0] > 0)
+    if times[0] >= 0 and times[-1] - first < len(every) and not (times % 1).any():
+        readings[f"count frames from {first}"] = every[times.astype(np.int64) - first] + offset
+    pairs = {remark: associate(of_frames, seconds, limit) for remark, seconds in readings.items()}
+    second, best = sorted(pairs, key=lambda remark: len(pairs[remark]))[-2:]
+    if len(pairs[best]) <= max(2 * len(pairs[""]), least):
         best = ""
-    elif 2 * counts[second] > counts[best]:
+    elif 2 * len(pairs[second]) > len(pairs[best]):
         raise InputError(f"{path}: its times either {best} or {second}: write them in seconds")
-    return readings[best] + tracker.time_offset, best
-
-
-def replay_trajectory(
-    file: Path,
-    source: SourceSettings,
-    tracker: TrajectorySettings,
-    progress: Progress | None,
-) -> ReplayedTracker:
-    """Open the images that have a pose in a trajectory in TUM's format, in the source's order.
-
-    Args:
-        file: The trajectory.
-        source: Settings of the images.
-        tracker: Settings of the tracker.
-        progress: Called while points are triangulated.
-
-    Raises:
-        InputError: If the trajectory is malformed, its times do not match the images, or as for `replay_poses`.
-    """
-    trajectory = read_trajectory_file(file)  # first, so that a wrong file is reported before images are listed
-    images = open_source(source)
-    rows, notes = rows_at_frames(images, source, file, trajectory.times, tracker)
-    poses = {name: trajectory.T_camera_world[row] for name, row in rows.items()}
-    if trajectory.left_out:
-        of = trajectory.left_out + len(trajectory.times)
-        notes.insert(0, f"{trajectory.left_out} of {of} lines of {file.name} hold NaN or a time out of order: left out")
-    return replay_poses(images, source, tracker, poses, notes, progress)
+    return readings[best], pairs[best], best
 
 
 def associate(times_a: ArrayLike, times_b: ArrayLike, max_difference: float = MAX_DIFFERENCE) -> NDArray[np.int64]:

@@ -10,7 +10,7 @@ from importlib import import_module
 from inspect import isclass
 from pkgutil import iter_modules
 
-from modp_ti.inputs.reader import TrackerSettings
+from modp_ti.inputs.reader import TrackerSettings, kind_of
 
 __all__ = ["READERS", "SOURCES"]
 
@@ -21,12 +21,16 @@ def _readers() -> dict[str, type[TrackerSettings]]:
         module = import_module(f"{__name__}.{name}")
         for reader in vars(module).values():
             if isclass(reader) and issubclass(reader, TrackerSettings) and reader.__module__ == module.__name__:
-                found[reader.model_fields["kind"].default] = reader
+                found[kind_of(reader)] = reader
     return found
 
 
 READERS = _readers()
 """The readers by `tracker.kind`, in alphabetical order."""
 
-SOURCES = {reader.source_kind: reader for reader in READERS.values() if reader.source_kind}
+SOURCES = {
+    reader.source_kind or kind: reader
+    for kind, reader in READERS.items()
+    if reader.open_images.__func__ is not TrackerSettings.open_images.__func__
+}
 """The readers of images by `source.kind`."""

@@ -18,18 +18,14 @@ from modp_ti.files import LARGEST, input_lines, open_file, parse_json, reading
 from modp_ti.files.errors import InputError
 from modp_ti.files.number_rows import NumberRows
 from modp_ti.files.trajectory import poses_of_quaternions
-from modp_ti.inputs.given_poses import posed_images, solving
-from modp_ti.inputs.multiview.triangulation import triangulated_frames
-from modp_ti.inputs.opening import open_source
 from modp_ti.inputs.point_cloud import spread_points
-from modp_ti.inputs.protocol import Progress
+from modp_ti.inputs.posed_recording import PosedRecording
 from modp_ti.inputs.reader import TimedPosesSettings
-from modp_ti.inputs.replay import PosedImage, ReplayedTracker
 from modp_ti.inputs.sources.protocol import ImageSource
-from modp_ti.inputs.timed_poses import require_rising, rows_at_frames
+from modp_ti.inputs.timed_poses import require_rising
 
 if TYPE_CHECKING:
-    from modp_ti.config.settings import SceneConfig, SourceSettings
+    from modp_ti.config.settings import SourceSettings
 
 CLOSED_LOOP, OPEN_LOOP = "closed_loop_trajectory.csv", "open_loop_trajectory.csv"
 CALIBRATION = "online_calibration.jsonl"
@@ -78,14 +74,12 @@ class CameraMounts:
 
 
 class AriaSettings(TimedPosesSettings):
-    """Trajectory and points of Project Aria's machine perception services (MPS)."""
+    """Output of Project Aria's machine perception services (MPS)."""
 
     source_kind: ClassVar[str] = "vrs"
     file_suffixes: ClassVar[Sequence[str]] = (".vrs",)
 
-    kind: Literal["aria"] = Field(
-        default="aria", description="output of Project Aria's machine perception services (MPS)"
-    )
+    kind: Literal["aria"] = "aria"
     path: Path | None = Field(
         default=None,
         description="MPS's folder, its `slam` or `trajectory` folder, or one of the two trajectories; empty: it is "
@@ -98,8 +92,8 @@ class AriaSettings(TimedPosesSettings):
     )
     max_dist_std: float = Field(default=0.05, gt=0, description="largest standard deviation of a point's distance [m]")
 
-    def open(self, scene: SceneConfig, progress: Progress | None = None) -> ReplayedTracker:
-        """Open the images that have a device pose within `tracker.max_difference` of their time, in the source's order.
+    def add_poses(self, recording: PosedRecording) -> None:
+        """Give images the device pose within `max_difference` of their time.
 
         The closed-loop trajectory is preferred to the open-loop one. Poses are T_world_camera = T_world_device
         T_device_camera, with T_device_camera from the online calibration nearest in time. If that file is missing, the
@@ -110,13 +104,11 @@ class AriaSettings(TimedPosesSettings):
         tracked and triangulated. The same happens with the open loop, because the points belong to the closed loop's
         world.
         """
-        source = scene.source
-        place = source.require_path()
-        folder, file = _trajectory_file(self.path, place)
+        images = recording.images
+        folder, file = _trajectory_file(self.path, recording.source.require_path())
         device = read_device_trajectory(file, open_loop=file.name == OPEN_LOOP)
         calibration = folder / CALIBRATION
         mounts = read_calibration(calibration, self.camera) if calibration.is_file() else None
-        images = open_source(source)
         missing = []
         if mounts is None:
             lost = f"{calibration} is missing: it would have brought where the camera {self.camera} sits on the device"
@@ -124,24 +116,23 @@ class AriaSettings(TimedPosesSettings):
                 raise InputError(f"{lost} (T_device_camera), without which device poses are no camera poses")
             mounts = CameraMounts(np.zeros(1), images.T_device_camera[None])
             missing.append(f"{lost} (T_device_camera) over time; the recording's own is taken")
-        rows, notes = rows_at_frames(images, source, file, device.times, self)
+        rows = self.rows_at_frames(recording, file, device.times)
         T_world_camera = np.stack([device.T_world_device[row] @ mounts.at(device.times[row]) for row in rows.values()])
-        reader, frames = posed_images(images, source, dict(zip(rows, inverse_poses(T_world_camera), strict=True)))
-        notes += [*_notes(device, None if missing else mounts, file), *missing]
+        recording.pose(dict(zip(rows, inverse_poses(T_world_camera), strict=True)))
+        recording.notes += [*_notes(device, None if missing else mounts, file), *missing]
 
         cloud = next((folder / name for name in POINTS if (folder / name).is_file()), None)
         if file.name == OPEN_LOOP or cloud is None:
             if file.name != OPEN_LOOP:
-                notes.append(
+                recording.notes.append(
                     f"{folder / POINTS[0]} is missing: it would have brought the points; features of the images are "
                     "tracked and triangulated instead"
                 )
-            frames = triangulated_frames(images, frames, solving(frames, source), progress)
-            return ReplayedTracker(reader, frames, notes)
+            recording.triangulate()
+            return
         numbers, xyz, total = read_points(cloud, device.world, self.max_inv_dist_std, self.max_dist_std)
-        notes.append(f"{len(numbers)} of {total} points of {cloud.name} are certain enough")
-        frames, note = _with_points(folder, frames, device.times[list(rows.values())], numbers, xyz, self.max_points)
-        return ReplayedTracker(reader, frames, [*notes, note])
+        recording.notes.append(f"{len(numbers)} of {total} points of {cloud.name} are certain enough")
+        _add_points(recording, folder, device.times[list(rows.values())], numbers, xyz, self.max_points)
 
     @classmethod
     def open_images(cls, path: Path, source: SourceSettings) -> ImageSource:
@@ -190,19 +181,19 @@ def _notes(device: DeviceTrajectory, mounts: CameraMounts | None, file: Path) ->
     return notes
 
 
-def _with_points(
+def _add_points(
+    recording: PosedRecording,
     folder: Path,
-    frames: list[PosedImage],
     times: NDArray[np.float64],
     numbers: NDArray[np.int64],
     xyz: NDArray[np.float64],
     limit: int,
-) -> tuple[list[PosedImage], str]:
-    """Return the frames, taken at device times (F,), with the points that they observe, and a remark for the user."""
+) -> None:
+    """Give the frames, taken at device times (F,), the points that they observe."""
     file = next((folder / name for name in OBSERVATIONS if (folder / name).is_file()), None)
     if file is None:
-        seen = [np.arange(len(xyz))] * len(frames)
-        note = (
+        seen = [np.arange(len(xyz))] * len(times)
+        recording.notes.append(
             f"{folder / OBSERVATIONS[0]} is missing: it would have said which points were seen at which time; every "
             "point is shown that projects into the frame and that no nearer one hides"
         )
@@ -212,16 +203,14 @@ def _with_points(
         for time in times:
             a, b = np.searchsorted(instants, (time - SEEN_WITHIN, time + SEEN_WITHIN))
             seen.append(np.unique(np.concatenate([np.zeros(0, np.int64), *groups[a:b]])))
-        note = f"points seen within {SEEN_WITHIN} s by the tracking cameras, at the pixels that they project to"
-    result = [
-        frame.with_points(spread_points(xyz[mine], numbers[mine], frame, limit))
-        for frame, mine in zip(frames, seen, strict=True)
-    ]
-    if not any(len(frame.points) for frame in result):
+        recording.notes.append(
+            f"points seen within {SEEN_WITHIN} s by the tracking cameras, at the pixels that they project to"
+        )
+    each = iter(seen)
+    if not recording.add_points(lambda frame: spread_points(xyz[mine := next(each)], numbers[mine], frame, limit)):
         raise InputError(
             f"{folder}: none of the {len(xyz)} points projects into any frame: is source.intrinsics right?"
         )
-    return result, note
 
 
 # ---- MPS's files -------------------------------------------------------------------------------------

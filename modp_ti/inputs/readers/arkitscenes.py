@@ -1,4 +1,4 @@
-"""Scenes of ARKitScenes: the low-resolution images of the wide camera."""
+"""Kind `arkitscenes`: scenes of ARKitScenes, of which the low-resolution images of the wide camera are used."""
 
 from __future__ import annotations
 
@@ -6,9 +6,8 @@ import re
 from typing import ClassVar, Literal
 
 import numpy as np
-from pydantic import Field
 
-from fields.geometry.se3 import exp_se3
+from fields.geometry.se3 import exp_se3, inverse_se3
 from modp_ti.files.errors import InputError
 from modp_ti.files.file_tree import FileTree
 from modp_ti.inputs.capture import Capture, CapturedFrame, depth_files, opencv_pose, plausible_camera, read_numbers
@@ -24,12 +23,11 @@ SAME_TIME, MAX_DIFFERENCE = 0.0015, 0.0055
 
 
 class ArkitScenesSettings(DepthCaptureSettings):
-    """A scene of ARKitScenes."""
+    """The poses of a scene of ARKitScenes."""
 
-    source_kind: ClassVar[str] = "arkitscenes"
     holds: ClassVar[str] = "lowres_wide, lowres_wide_intrinsics and lowres_wide.traj"
 
-    kind: Literal["arkitscenes"] = Field(default="arkitscenes", description="the poses of a scene of ARKitScenes")
+    kind: Literal["arkitscenes"] = "arkitscenes"
 
     @classmethod
     def recognises(cls, tree: FileTree) -> bool:
@@ -40,31 +38,26 @@ class ArkitScenesSettings(DepthCaptureSettings):
         """Read the images that have intrinsics, with the pose nearest in time.
 
         A row of the trajectory is a time, an axis times an angle and a translation, world to camera.
-
-        Raises:
-            InputError: If a file is malformed, or no image has intrinsics.
         """
         images, cameras = _timed(tree, IMAGES, ".png"), _timed(tree, INTRINSICS, ".pincam")
         if not images or not cameras:
             raise InputError(f"{tree.path}: holds no images in {IMAGES}, or no intrinsics in {INTRINSICS}")
-        times = np.array(list(images))
+        times, files = np.array(list(images)), list(cameras.values())
         camera_of = dict(associate(times, list(cameras), SAME_TIME).tolist())
-        rows, lines = read_numbers(tree, TRAJECTORY, 7, "time, rx, ry, rz, tx, ty, tz")
+        rows = read_numbers(tree, TRAJECTORY, 7, "time, rx, ry, rz, tx, ty, tz")
         pose_of = dict(associate(times, rows[:, 0], MAX_DIFFERENCE).tolist())
-        files = list(cameras.values())
         frames = []
         for n, (time, name) in enumerate(images.items()):
             if n not in camera_of:
                 continue
             file = files[camera_of[n]]
-            values, file_lines = read_numbers(tree, file, 6, "width height fx fy cx cy")
-            width, height, fx, fy, cx, cy = values[0]
-            camera = plausible_camera(fx, fy, cx, cy, (width, height), f"{tree.path / file}:{file_lines[0]}")
-            T = _pose(rows[pose_of[n]], f"{tree.path / TRAJECTORY}:{lines[pose_of[n]]}") if n in pose_of else None
+            width, height, fx, fy, cx, cy = read_numbers(tree, file, 6, "width height fx fy cx cy")[0]
+            camera = plausible_camera(fx, fy, cx, cy, (width, height), f"{tree.path / file}")
+            T = _pose(rows[pose_of[n]], f"{tree.path / TRAJECTORY}: time {time:.3f}") if n in pose_of else None
             stem = name[len(IMAGES) + 1 :]
             depth, confidence = depth_files(tree, f"lowres_depth/{stem}", f"confidence/{stem}")
             frames.append(CapturedFrame(name, time, camera, T, depth=depth, confidence=confidence))
-        notes = [f"{tree.path}: is a scene of ARKitScenes"]
+        notes = []
         if len(frames) < len(images):
             notes.append(f"{len(images) - len(frames)} of its {len(images)} images have no intrinsics: left out")
         return Capture(tree, TRAJECTORY, frames, notes, read_depth=millimetre_png(CONFIDENT))
@@ -76,7 +69,7 @@ def _pose(row: np.ndarray, where: str) -> np.ndarray:
         raise InputError(f"{where}: the rotation is none; the file is damaged")
     T = exp_se3([0.0, 0.0, 0.0, *row[1:4]])
     T[:3, 3] = row[4:7]
-    return np.linalg.inv(opencv_pose(T, where))
+    return inverse_se3(opencv_pose(T, where))
 
 
 def _timed(tree: FileTree, folder: str, suffix: str) -> dict[float, str]:

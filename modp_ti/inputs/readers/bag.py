@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,27 +16,22 @@ from modp_ti.files.file_tree import FileTree
 from modp_ti.inputs.bags.bag import CLOUD, POSES, SUFFIXES, has_poses, is_bag
 from modp_ti.inputs.bags.points import DepthTopic, depth_topics, read_depth_topic, with_depth_points, world_points
 from modp_ti.inputs.bags.transforms import FrameTree, clean, read_frame_tree, read_pose_topic
-from modp_ti.inputs.given_poses import posed_images, selected_frames, solving
-from modp_ti.inputs.multiview.triangulation import adjusted_frames, triangulated_frames
-from modp_ti.inputs.opening import open_source
 from modp_ti.inputs.point_cloud import spread_points
-from modp_ti.inputs.protocol import Progress
-from modp_ti.inputs.reader import TrackerSettings
-from modp_ti.inputs.replay import PosedImage, ReplayedTracker
+from modp_ti.inputs.posed_recording import PosedRecording
+from modp_ti.inputs.reader import PosesSettings
 from modp_ti.inputs.sources.protocol import ImageSource
 
 if TYPE_CHECKING:
-    from modp_ti.config.settings import SceneConfig, SourceSettings
+    from modp_ti.config.settings import SourceSettings
     from modp_ti.inputs.bags.images import BagImages
 
 
-class BagSettings(TrackerSettings):
-    """Poses and points of a ROS bag."""
+class BagSettings(PosesSettings):
+    """The poses of a ROS bag."""
 
-    source_kind: ClassVar[str] = "bag"
     file_suffixes: ClassVar[Sequence[str]] = SUFFIXES
 
-    kind: Literal["bag"] = Field(default="bag", description="the poses of a ROS bag")
+    kind: Literal["bag"] = "bag"
     pose: str | None = Field(
         default=None,
         description="topic of the poses (Odometry, PoseStamped, PoseWithCovarianceStamped, TransformStamped), or `tf` "
@@ -79,8 +74,8 @@ class BagSettings(TrackerSettings):
         "more than a pixel",
     )
 
-    def open(self, scene: SceneConfig, progress: Progress | None = None) -> ReplayedTracker:
-        """Open the images that were taken while the poses of a bag are known.
+    def add_poses(self, recording: PosedRecording) -> None:
+        """Give the images that were taken while the poses of a bag are known these poses.
 
         The poses are those of the topic `pose`, moved to the camera by the transforms of the bag, or those transforms
         alone. The points are those of the depth images of `depth`, or of all clouds of `points`; without, they are
@@ -88,15 +83,9 @@ class BagSettings(TrackerSettings):
         """
         from modp_ti.inputs.bags.images import BagImages
 
-        source = scene.source
-        images = open_source(source)
-        try:
-            if not isinstance(images, BagImages):
-                raise InputError(f"{source.path}: tracker.kind: bag reads the poses of a ROS bag, and this is none")
-            return _opened(images, source, self, progress)
-        except InputError:
-            images.close()
-            raise
+        if not isinstance(recording.images, BagImages):
+            raise InputError(f"{recording.source.path}: tracker.kind: bag reads the poses of a ROS bag: this is none")
+        _pose(recording, recording.images, self)
 
     @classmethod
     def recognises(cls, tree: FileTree) -> bool:
@@ -110,17 +99,16 @@ class BagSettings(TrackerSettings):
         return BagImages(path, source.bag, source.stop, calibrated=not source.intrinsics.given)
 
     @classmethod
-    def poses_of(cls, path: Path) -> tuple[dict[str, Any], Path] | None:
-        return ({}, path) if has_poses(path) else None
+    def poses_of(cls, path: Path) -> Path | None:
+        return path if has_poses(path) else None
 
 
-def _opened(
-    images: BagImages, source: SourceSettings, tracker: BagSettings, progress: Progress | None
-) -> ReplayedTracker:
+def _pose(recording: PosedRecording, images: BagImages, tracker: BagSettings) -> None:
     tree = read_frame_tree(images.bag)
-    world, notes = _with_poses(images, tracker, tree)
+    notes = recording.notes
+    world = _with_poses(images, tracker, tree, notes)
     camera = clean(tracker.camera or images.frame_id)
-    names = selected_frames(images, source)
+    names = recording.selected
     times = np.array([images.timestamp(name) for name in names])
     T_world_camera = tree.at(world, camera, times, tracker.max_gap)
     if T_world_camera is None:
@@ -144,28 +132,26 @@ def _opened(
         )
     T_camera_world = inverse_poses(T_world_camera[known])
     named = [name for name, its in zip(names, known, strict=True) if its]
-    reader, frames = posed_images(images, source, dict(zip(named, T_camera_world, strict=True)))
+    recording.pose(dict(zip(named, T_camera_world, strict=True)))
     if tracker.adjust:
-        frames, note = adjusted_frames(images, frames, solving(frames, source), progress)
-        return ReplayedTracker(reader, frames, [*notes, note])
-    with_depths = _with_depths(images, tracker, tree, world, frames, times[known], notes, progress)
-    if with_depths is not None:
-        return ReplayedTracker(reader, with_depths, notes)
+        recording.adjust()
+        return
+    if _add_depths(recording, images, tracker, tree, world, times[known]):
+        return
     xyz = _points(images, tracker, tree, world, notes)
     if xyz is None:
-        return ReplayedTracker(reader, triangulated_frames(images, frames, solving(frames, source), progress), notes)
+        recording.triangulate()
+        return
     numbers = np.arange(len(xyz))
-    frames = [frame.with_points(spread_points(xyz, numbers, frame, tracker.max_points)) for frame in frames]
-    if not any(len(frame.points) for frame in frames):
+    if not recording.add_points(lambda frame: spread_points(xyz, numbers, frame, tracker.max_points)):
         raise InputError(
-            f"{images.path}: none of the {len(xyz)} points is seen by any of the {len(frames)} images: set "
+            f"{images.path}: none of the {len(xyz)} points is seen by any of the {len(recording.frames)} images: set "
             "tracker.points: none to have points triangulated"
         )
-    return ReplayedTracker(reader, frames, notes)
 
 
-def _with_poses(images: BagImages, tracker: BagSettings, tree: FrameTree) -> tuple[str, list[str]]:
-    """Add the poses of the chosen topic to the transforms, and return the world's frame and remarks for the user."""
+def _with_poses(images: BagImages, tracker: BagSettings, tree: FrameTree, notes: list[str]) -> str:
+    """Add the poses of the chosen topic to the transforms, and return the world's frame. Adds remarks for the user."""
     bag, topics = images.bag, images.bag.pose_topics
     if tracker.pose is not None and tracker.pose != "tf":
         topics = [bag.chosen(tracker.pose, POSES, "tracker.pose")]
@@ -174,7 +160,8 @@ def _with_poses(images: BagImages, tracker: BagSettings, tree: FrameTree) -> tup
         world = clean(tracker.world or tree.root(camera))
         if not tree.moves:
             raise InputError(f"{bag.path}: holds no poses: set tracker.kind: klt to track the images alone")
-        return world, [f"{bag.path}: poses of {camera} in {world} by the tf tree"]
+        notes.append(f"{bag.path}: poses of {camera} in {world} by the tf tree")
+        return world
     topic, *others = topics
     poses = read_pose_topic(bag, topic)
     body = clean(tracker.body or poses.body or camera)
@@ -182,39 +169,40 @@ def _with_poses(images: BagImages, tracker: BagSettings, tree: FrameTree) -> tup
     world = clean(tracker.world or poses.world)
     choice = f"; there are also {', '.join(others)} (tracker.pose)" if others else ""
     taken = "" if tracker.body or poses.body else f", which does not say of what: of {camera} (tracker.body)"
-    return world, [f"{bag.path}: poses of {body} in {poses.world} by {topic}{taken}{choice}"]
+    notes.append(f"{bag.path}: poses of {body} in {poses.world} by {topic}{taken}{choice}")
+    return world
 
 
-def _with_depths(
+def _add_depths(
+    recording: PosedRecording,
     images: BagImages,
     tracker: BagSettings,
     tree: FrameTree,
     world: str,
-    frames: list[PosedImage],
     times: NDArray[np.float64],
-    notes: list[str],
-    progress: Progress | None,
-) -> list[PosedImage] | None:
-    """Return the frames with points of depth images, None if the bag has none. Adds remarks for the user."""
+) -> bool:
+    """Give the frames points of depth images. Returns whether the bag has some that can be used."""
     if tracker.depth == "none" or (tracker.depth is None and tracker.points is not None):
-        return None
+        return False
     try:
-        topic = _depth_topic(images, tracker.depth, notes)
+        topic = _depth_topic(images, tracker.depth, recording.notes)
         if topic is None:
-            return None
+            return False
         T_world_sensor = tree.at(world, topic.frame, topic.times, tracker.max_gap)
         if T_world_sensor is None:
             raise InputError(
                 f"{images.path}: no transform leads from {topic.frame!r}, the frame of {topic.name}, to {world!r}"
             )
-        frames, note = with_depth_points(images.bag, topic, T_world_sensor, frames, times, tracker, progress)
+        recording.frames, note = with_depth_points(
+            images.bag, topic, T_world_sensor, recording.frames, times, tracker, recording.progress
+        )
     except InputError as error:
         if tracker.depth is not None:
             raise
-        notes.append(f"{error}: depth images are not used")
-        return None
-    notes.append(note)
-    return frames
+        recording.notes.append(f"{error}: depth images are not used")
+        return False
+    recording.notes.append(note)
+    return True
 
 
 def _depth_topic(images: BagImages, given: str | None, notes: list[str]) -> DepthTopic | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
@@ -14,28 +14,14 @@ from fields.geometry.camera import PinholeCamera
 from modp_ti.files.errors import InputError
 from modp_ti.files.trajectory import FARTHEST, checked_pose
 from modp_ti.inputs.colmap_model import ColmapModel, ModelCamera, ModelImage, image_count, read_colmap_model
-from modp_ti.inputs.given_poses import (
-    PANORAMAS,
-    checked_reader,
-    matched_entries,
-    missing_frames_note,
-    selected_frames,
-    solving,
-    triangulated_views,
-)
-from modp_ti.inputs.opening import open_source
 from modp_ti.inputs.point_cloud import spread_points
-from modp_ti.inputs.protocol import Progress
+from modp_ti.inputs.posed_recording import PANORAMAS, PosedRecording, StoredView
 from modp_ti.inputs.reader import GivenPosesSettings, RecordedSettings
-from modp_ti.inputs.replay import PosedImage, ReplayedTracker, points_inside
-from modp_ti.inputs.sources import Distortion, ImageSource
+from modp_ti.inputs.replay import PosedImage, points_inside
+from modp_ti.inputs.sources import Distortion
 from modp_ti.inputs.sources.distortion import colmap_intrinsics
 from modp_ti.inputs.sources.intrinsics import require_plausible
 from modp_ti.inputs.sources.orientation import Turn
-from modp_ti.inputs.stored_cameras import StoredView, stored_frames
-
-if TYPE_CHECKING:
-    from modp_ti.config.settings import SceneConfig, SourceSettings
 
 TOPS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
 
@@ -44,40 +30,37 @@ MOST_PROJECTED: int = GivenPosesSettings.model_fields["max_points"].default
 
 
 class ColmapSettings(RecordedSettings):
-    """A COLMAP model, binary or text."""
+    """A COLMAP model."""
 
     brings_cameras: ClassVar[bool] = True
     pose_files: ClassVar[Sequence[str]] = tuple(f"{top}/images.*" for top in TOPS)
 
-    kind: Literal["colmap"] = Field(default="colmap", description="a COLMAP model")
+    kind: Literal["colmap"] = "colmap"
     path: Path | None = Field(
         default=None,
         description="folder with cameras, images and points3D, or the parent of such a folder `0`; empty: `sparse/0` "
         "or `sparse`, next to the images' folder or in it",
     )
 
-    def open(self, scene: SceneConfig, progress: Progress | None = None) -> ReplayedTracker:
-        """Open the images that have a pose in the model, in natural order; see `open_model`."""
-        return open_model(scene.source, self.path, progress)
+    def add_poses(self, recording: PosedRecording) -> None:
+        """Give images their pose in the model, as `pose_by_model` does."""
+        pose_by_model(recording, self.path)
 
     @classmethod
-    def poses_of(cls, path: Path) -> tuple[dict[str, Any], Path] | None:
+    def poses_of(cls, path: Path) -> Path | None:
         found = super().poses_of(path)
-        return None if found is None else ({"path": str(found[1].parent)}, found[1])
+        return found and found.parent
 
 
-def open_model(
-    source: SourceSettings, given: Path | None, progress: Progress | None = None, upright: bool = False
-) -> ReplayedTracker:
-    """Open the images that have a pose in the model, in natural order, with the points that each observes.
+def pose_by_model(recording: PosedRecording, given: Path | None, upright: bool = False) -> None:
+    """Give images their pose in a model, in natural order, and the points that each observes.
 
     Where no image observes any, each gets the points of the model that project into it. Where the model has none, they
-    are triangulated before the first frame is delivered.
+    are triangulated.
 
     Args:
-        source: Settings of the images.
+        recording: The images.
         given: Folder of the model, or of models; None for the usual places.
-        progress: Called while points are triangulated.
         upright: Whether the model was made from the images turned as their EXIF orientation says. Otherwise the sizes
             of its cameras tell.
 
@@ -85,70 +68,58 @@ def open_model(
         InputError: If the model is missing or damaged, has an unsupported camera model, has no image in the folder, or
             if images do not match their cameras.
     """
-    place = source.require_path()
-    images = open_source(source)
-    folder, notes = _model_folder(place, given)
+    folder = _model_folder(recording, given)
     model = read_colmap_model(folder, posed_alone=True)
     if not model.images:
         raise InputError(f"{folder}: the COLMAP model holds no image")
-    stated = [(image.name, image) for image in model.images.values()]
-    if len(images.mounts) > 1:
-        posed, more = _posed_faces(images, source, dict(stated), folder)
+    images, selected = recording.images, recording.selected
+    if len(images.mounts) > 1:  # all faces of a panorama have a pose, or none
+        stated = {image.name: image for image in model.images.values()}
+        posed = {face: stated[face] for name in selected for face in images.views(name) if face in stated}
+        recording.note_missing({name: None for name in selected if images.views(name)[0] in posed}, str(folder))
     else:
-        posed, more = matched_entries(images, source, stated, folder, str(folder), "images")
+        entries = [(image.name, image) for image in model.images.values()]
+        posed = recording.matched(entries, folder, str(folder), "images")
     cameras = {number: _camera(number, camera, folder) for number, camera in model.cameras.items()}
     views = {
         name: StoredView(*cameras[image.camera], checked_pose(image.T_camera_world, f"{folder}: image {image.name}"))
         for name, image in posed.items()
     }
-    frames, turns, turned = stored_frames(images, views, str(folder), upright)
-    reader = checked_reader(images, source, {frame.name: frame.undistorter for frame in frames}, str(folder))
+    turns = dict(zip(views, recording.pose_stored(views, str(folder), upright), strict=True))
 
     near, count = np.abs(model.xyz).max(axis=1, initial=0.0) <= FARTHEST, len(model.ids)
     ids, xyz = model.ids[near], model.xyz[near]
-    notes += [*more, *turned]
     if len(ids) < count:
-        notes.append(f"{count - len(ids)} of {count} points of {folder} are NaN or infinite: left out")
-    if count or any((folder / f"points3D{suffix}").exists() for suffix in (".bin", ".txt")):
-        pairs = zip(frames, turns, posed.values(), strict=True)
-        frames = [frame.with_points(_observed(image, model, frame, turn)) for frame, turn, image in pairs]
-    if not any(len(frame.points) for frame in frames):
-        if len(ids):
-            frames = [frame.with_points(spread_points(xyz, ids, frame, MOST_PROJECTED)) for frame in frames]
-            notes.append(f"no image of {folder} observes a point: each gets those that project into it")
-        if not any(len(frame.points) for frame in frames):
-            notes.append(f"the images of {folder} see none of its {count} points: triangulated instead")
-            frames = triangulated_views(images, frames, solving(frames, source), progress)
-    return ReplayedTracker(reader, frames, notes)
+        recording.notes.append(f"{count - len(ids)} of {count} points of {folder} are NaN or infinite: left out")
+    if count and recording.add_points(lambda frame: _observed(posed[frame.name], model, frame, turns[frame.name])):
+        return
+    if len(ids) and recording.add_points(lambda frame: spread_points(xyz, ids, frame, MOST_PROJECTED)):
+        recording.notes.append(f"no image of {folder} observes a point: each gets those that project into it")
+        return
+    recording.notes.append(f"the images of {folder} see none of its {count} points: triangulated instead")
+    recording.triangulate()
 
 
-def _posed_faces(
-    images: ImageSource, source: SourceSettings, stated: dict[str, ModelImage], folder: Path
-) -> tuple[dict[str, ModelImage], list[str]]:
-    """Match the images of a model of faces with the selected panoramas, all of whose faces have a pose or none."""
-    selected = selected_frames(images, source)
-    posed = {face: stated[face] for name in selected for face in images.views(name) if face in stated}
-    whole = {name: None for name in selected if images.views(name)[0] in posed}
-    return posed, missing_frames_note(selected, whole, str(folder))
-
-
-def _model_folder(images: Path, given: Path | None) -> tuple[Path, list[str]]:
-    """Return the folder with cameras, images and points3D, and a remark if it was chosen of several.
+def _model_folder(recording: PosedRecording, given: Path | None) -> Path:
+    """Return the folder with cameras, images and points3D.
 
     COLMAP writes a model to each of the folders 0, 1, ... where it cannot join all images. That of most images is used.
     """
+    images = recording.source.require_path()
     roots = [given] if given is not None else [images.parent / "sparse", images / "sparse"]
     for root in roots:
         numbered = [root / "0", *sorted((f for f in root.glob("[0-9]*") if f.name != "0"), key=lambda f: f.name)]
         own = [root] if _is_model(root) else []
         parts = list(filter(_is_model, numbered))
         if own and (given is not None or not parts):
-            return root, []
-        if parts:
-            counts = {folder: image_count(folder) for folder in parts} if len(parts) > 1 else {parts[0]: 0}
-            best = max(counts, key=lambda folder: counts[folder])
+            return root
+        if len(parts) > 1:
+            counts = {folder: image_count(folder) for folder in parts}
+            parts.sort(key=lambda folder: -counts[folder])
             said = ", ".join(f"{folder.name} with {count} images" for folder, count in counts.items())
-            return best, [f"{root} holds several models, {said}: {best.name} is used"] if len(parts) > 1 else []
+            recording.notes.append(f"{root} holds several models, {said}: {parts[0].name} is used")
+        if parts:
+            return parts[0]
     if given is None:
         raise InputError(f"no COLMAP model in {images.parent / 'sparse'} or its folder 0: set tracker.path")
     if not given.exists():

@@ -1,16 +1,15 @@
-"""Sequences of EuRoC MAV and data sets in its layout: the left camera, and the true poses of the body."""
+"""Kind `euroc`: sequences in EuRoC's layout, of which the left camera and the true poses of the body are used."""
 
 from __future__ import annotations
 
 from typing import Any, ClassVar, Literal
 
 import numpy as np
-from pydantic import Field
 
 from fields.geometry.se3 import inverse_se3
+from modp_ti.files import reading
 from modp_ti.files.errors import InputError
-from modp_ti.files.file_tree import FileTree
-from modp_ti.files.reading import reading
+from modp_ti.files.file_tree import SETTING, FileTree
 from modp_ti.files.trajectory import poses_of_quaternions
 from modp_ti.files.yaml_text import parse_yaml
 from modp_ti.inputs.capture import (
@@ -34,12 +33,11 @@ NANOSECOND = 1e-9
 
 
 class EurocSettings(CaptureSettings):
-    """A sequence in EuRoC's layout."""
+    """The true poses of a sequence in EuRoC's layout."""
 
-    source_kind: ClassVar[str] = "euroc"
     holds: ClassVar[str] = "mav0/cam0/data.csv and mav0/cam0/sensor.yaml"
 
-    kind: Literal["euroc"] = Field(default="euroc", description="the true poses of a sequence in EuRoC's layout")
+    kind: Literal["euroc"] = "euroc"
 
     @classmethod
     def recognises(cls, tree: FileTree) -> bool:
@@ -50,45 +48,43 @@ class EurocSettings(CaptureSettings):
         """Read the images of the left camera with the true poses. Images without one, as before the truth begins, stay.
 
         T_world_camera is T_world_body of the truth times T_BS of the camera. A sequence without the truth has no poses.
-
-        Raises:
-            InputError: If a file is missing or malformed.
         """
         top = _top(tree) or ""
-        sensor = _sensor(tree, top + SENSOR)
-        where = str(tree.path / (top + SENSOR))
-        size = checked_numbers(sensor.get("resolution"), 2, f"{where}: `resolution`")
+        sensor, where = _sensor(tree, top + SENSOR), str(tree.path / (top + SENSOR))
+        width, height = checked_numbers(sensor.get("resolution"), 2, f"{where}: `resolution`")
         fx, fy, cx, cy = checked_numbers(sensor.get("intrinsics"), 4, f"{where}: `intrinsics`")
         lens = _lens(sensor, where)
         # The calibration has pixel centres at whole numbers.
-        camera = plausible_camera(fx, fy, cx + 0.5, cy + 0.5, (size[0], size[1]), where, lens)
+        camera = plausible_camera(fx, fy, cx + 0.5, cy + 0.5, (width, height), where, lens)
         T_camera_body = opencv_pose(_mount(sensor, where), f"{where}: `T_BS`")
 
-        listed = [_listed(line, f"{tree.path / (top + LISTING)}:{n}") for n, line in read_lines(tree, top + LISTING)]
-        there = [(time, f"{top}cam0/data/{name}") for time, name in listed if tree.has(f"{top}cam0/data/{name}")]
+        listed = {}
+        for n, line in read_lines(tree, top + LISTING):
+            time, _, name = (part.strip() for part in line.partition(","))
+            if not (time.isascii() and time.isdecimal() and len(time) <= 20 and name):
+                raise InputError(f"{tree.path / (top + LISTING)}:{n}: must be a time in nanoseconds and a file name")
+            listed[f"{top}cam0/data/{name}"] = int(time) * NANOSECOND
+        there = {name: time for name, time in listed.items() if tree.has(name)}
         if not there:
             raise InputError(f"{tree.path / (top + LISTING)}: none of its {len(listed)} images is there")
         folder = next((name for name in TRUTHS if tree.has(f"{top}{name}/data.csv")), TRUTHS[0])
         origin, markers = f"{top}{folder}/data.csv", f"{top}{folder}/sensor.yaml"
         pose_of, T_world_body = {}, np.zeros((0, 4, 4))
         if tree.has(origin):
-            rows, lines = read_numbers(tree, origin, 8, "time, px, py, pz, qw, qx, qy, qz, ...")
-            of_line = lambda n: f"{tree.path / origin}:{lines[n]}"  # noqa: E731
-            T_world_body = poses_of_quaternions(rows[:, 1:4], rows[:, [5, 6, 7, 4]], of_line)
+            rows = read_numbers(tree, origin, 8, "time, px, py, pz, qw, qx, qy, qz, ...")
+            T_world_body = poses_of_quaternions(
+                rows[:, 1:4], rows[:, [5, 6, 7, 4]], lambda n: f"{tree.path / origin}: pose {n}"
+            )
             if folder != TRUTHS[0] and tree.has(markers):
                 T_world_body = T_world_body @ opencv_pose(_mount(_sensor(tree, markers), markers), f"{markers}: `T_BS`")
-            pose_of = dict(
-                associate(np.array([time for time, _ in there]), rows[:, 0] * NANOSECOND, MAX_DIFFERENCE).tolist()
-            )
+            pose_of = dict(associate(list(there.values()), rows[:, 0] * NANOSECOND, MAX_DIFFERENCE).tolist())
         frames = []
-        for n, (time, name) in enumerate(there):
+        for n, (name, time) in enumerate(there.items()):
             T = T_camera_body @ inverse_se3(T_world_body[pose_of[n]]) if n in pose_of else None
             frames.append(CapturedFrame(name, time, camera, T, lens))
-        notes = [f"{tree.path}: is a sequence in EuRoC's layout, of which the left camera is used"]
+        notes = []
         if len(there) < len(listed):
-            notes.append(
-                f"{len(listed) - len(there)} of the {len(listed)} images that {top}{LISTING} lists are not there"
-            )
+            notes.append(f"{len(listed) - len(there)} of the {len(listed)} images of {top}{LISTING} are not there")
         return Capture(tree, origin, frames, notes)
 
 
@@ -98,7 +94,7 @@ def _top(tree: FileTree) -> str | None:
 
 def _sensor(tree: FileTree, name: str) -> dict[str, Any]:
     """Read the camera's YAML. Some have OpenCV's first line and tags, which are not those of YAML."""
-    with reading(tree.path / name, " (source.path)"):
+    with reading(tree.path / name, SETTING):
         text = tree.read_text(name)
     plain = "\n".join("" if line.startswith("%YAML") else line for line in text.splitlines())
     data = parse_yaml(plain.replace("!!opencv-matrix", ""), str(tree.path / name), {})
@@ -121,11 +117,3 @@ def _lens(sensor: dict[str, Any], where: str) -> Distortion:
         raise InputError(f"{where}: the lens model {model[:40]!r} is not supported (radial-tangential, equidistant)")
     count = len(values) if isinstance(values, list) and len(values) in (5, 8) else 4
     return lens_of_model(model, checked_numbers(values, count, f"{where}: `distortion_coefficients`"), where)
-
-
-def _listed(line: str, where: str) -> tuple[float, str]:
-    """Time [s] and file name of a line of the images' table."""
-    first, _, name = (part.strip() for part in line.partition(","))
-    if not (first.isascii() and first.isdecimal() and len(first) <= 20 and name):
-        raise InputError(f"{where}: must be a time in nanoseconds and a file name, not {line[:60]!r}")
-    return int(first) * NANOSECOND, name

@@ -14,11 +14,11 @@ if TYPE_CHECKING:
 
 
 class KltSettings(TrackerSettings):
-    """The built-in tracker, which needs only the images."""
+    """The built-in tracker, which uses only the images."""
 
     follows_streams: ClassVar[bool] = True
 
-    kind: Literal["klt"] = Field(default="klt", description="the built-in tracker, which uses only the images")
+    kind: Literal["klt"] = "klt"
     loops: bool = Field(
         default=False,
         description="close loops, drift of scale included, where the camera comes back after a long way. Needs "

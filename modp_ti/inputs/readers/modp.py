@@ -5,34 +5,32 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from fields.frames.tracked_frame import SparsePoints
 from fields.geometry.camera import PinholeCamera
-from modp_ti.files import LARGEST, open_file, reading
+from modp_ti.files import LARGEST
 from modp_ti.files.errors import InputError
 from modp_ti.files.file_tree import FileTree
 from modp_ti.files.number_rows import read_number_rows
-from modp_ti.files.trajectory import checked_pose
-from modp_ti.inputs.given_poses import found_file, matched_entries, posed_images, read_entries
-from modp_ti.inputs.opening import open_source
+from modp_ti.inputs.capture import rigid_motion
 from modp_ti.inputs.point_cloud import projected_points, read_npy_points
-from modp_ti.inputs.protocol import Progress
+from modp_ti.inputs.posed_recording import PosedRecording, read_entries
 from modp_ti.inputs.reader import RecordedSettings
-from modp_ti.inputs.replay import ReplayedTracker
+from modp_ti.inputs.replay import PosedImage
 from modp_ti.inputs.sources.image_folder import ImageFolder
 from modp_ti.inputs.sources.intrinsics import Intrinsics
 from modp_ti.inputs.sources.masks import read_vignette
 
 if TYPE_CHECKING:
-    from modp_ti.config.settings import SceneConfig, SourceSettings
+    from modp_ti.config.settings import SourceSettings
 
-POSES = "trajectory.json"
-# File names that the release uses with ORB-SLAM3 as its tracker.
-POSES_ORB = "trajectory_orb.json"
+# File names of the release, and those that it uses with ORB-SLAM3 as its tracker.
+POSES, POSES_ORB = "trajectory.json", "trajectory_orb.json"
 CAMERA, IMAGES = PinholeCamera(400.0, 400.0, 400.0, 400.0, 800, 800), "rectified"
 CLOUDS = {POSES: "point_cloud", POSES_ORB: "orb_point_clouds"}
 
@@ -43,49 +41,39 @@ class ModpSettings(RecordedSettings):
     source_kind: ClassVar[str] = "release"
     pose_files: ClassVar[Sequence[str]] = (POSES,)
 
-    kind: Literal["modp"] = Field(default="modp", description="the files of the paper's release")
+    kind: Literal["modp"] = "modp"
     path: Path | None = Field(
         default=None,
         description="the file of poses or its folder; empty: `trajectory.json` or `trajectory_orb.json`, in the "
         "images' folder or next to it",
     )
 
-    def open(self, scene: SceneConfig, progress: Progress | None = None) -> ReplayedTracker:
-        """Open the images that have a pose in the JSON file, in the source's order, each with the points of its file.
+    def add_poses(self, recording: PosedRecording) -> None:
+        """Give images their pose in the JSON file, and the points of the file of the same number.
 
         Points have no ids in these files: points with the same coordinates are treated as one point. Pixels are
         projections.
         """
-        source = scene.source
-        place = source.require_path()
-        guesses = [folder / name for name in (POSES, POSES_ORB) for folder in (place, place.parent)]
-        file = found_file(self.path, guesses, f"the release's {POSES} or {POSES_ORB}")
+        file = self.found(recording.source, (POSES, POSES_ORB), f"the release's {POSES} or {POSES_ORB}")
         _, cameras = read_entries(file, "cameras", "image", "a trajectory of the release")
         stated = [
-            (image, (number, _pose(file, number, image, camera.get("T_camera_world"))))
+            (image, (number, rigid_motion(camera.get("T_camera_world"), f"{file}: camera {number} ({image})")))
             for number, (image, camera) in enumerate(cameras)
         ]
         folder = file.parent / CLOUDS.get(file.name, CLOUDS[POSES])
         clouds = _cloud_files(folder)
-        images = open_source(source)
-        entries, notes = matched_entries(images, source, stated, file, file.name, "cameras")
-        numbers = [number for number, _ in entries.values()]
-        reader, posed = posed_images(images, source, {name: T for name, (_, T) in entries.items()})
-        xyz = [_read_cloud(clouds[number]) if number in clouds else np.zeros((0, 3)) for number in numbers]
-        if not any(len(each) for each in xyz):
-            raise InputError(f"{folder}: holds no point for any of the {len(entries)} frames")
+        entries = recording.matched(stated, file, file.name, "cameras")
+        recording.pose({name: T for name, (_, T) in entries.items()})
+        xyz = [_read_cloud(clouds[n]) if n in clouds else np.zeros((0, 3)) for n, _ in entries.values()]
         # The same coordinates get the same id in all files.
         _, ids = np.unique(np.concatenate(xyz), axis=0, return_inverse=True)
         ends = np.cumsum([len(cloud) for cloud in xyz])
-        frames = []
-        for frame, cloud, stated_ids in zip(posed, xyz, np.split(ids.reshape(-1), ends[:-1]), strict=True):
-            mine, rows = np.unique(stated_ids, return_index=True)
-            points = projected_points(cloud[rows], mine, frame.undistorter, frame.T_camera_world)
-            frames.append(frame.with_points(points))
-        without = sum(number not in clouds for number in numbers)
+        points = dict(zip(entries, zip(xyz, np.split(ids.reshape(-1), ends[:-1]), strict=True), strict=True))
+        if not recording.add_points(lambda frame: _projected(*points[frame.name], frame)):
+            raise InputError(f"{folder}: holds no point that one of the {len(entries)} frames sees")
+        without = sum(number not in clouds for number, _ in entries.values())
         if without:
-            notes.append(f"{without} frames have no file of points in {folder}: they bring none")
-        return ReplayedTracker(reader, frames, notes)
+            recording.notes.append(f"{without} frames have no file of points in {folder}: they bring none")
 
     @classmethod
     def recognises(cls, tree: FileTree) -> bool:
@@ -111,41 +99,30 @@ class ModpSettings(RecordedSettings):
         return images
 
 
-def _pose(file: Path, number: int, image: str, stated: Any) -> NDArray[np.float64]:
-    """Read `T_camera_world` of an entry."""
-    what = f"{file}: camera {number} ({image})"
-    try:
-        matrix = np.array(stated, dtype=np.float64)
-    except (ValueError, TypeError, OverflowError):
-        matrix = np.zeros(0)
-    if matrix.shape != (4, 4):
-        raise InputError(f"{what}: `T_camera_world` must be 4 rows of 4 numbers")
-    return checked_pose(matrix, what)
+def _projected(xyz: NDArray[np.float64], stated: NDArray[np.int64], frame: PosedImage) -> SparsePoints:
+    """Return the points (N, 3) with these ids, each once."""
+    ids, rows = np.unique(stated, return_index=True)
+    return projected_points(xyz[rows], ids, frame.undistorter, frame.T_camera_world)
 
 
 def _cloud_files(folder: Path) -> dict[int, Path]:
     """Return the point file of each camera number."""
-    if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder: it would have brought the points of each frame, point_cloud_0.txt")
     clouds: dict[int, Path] = {}
-    for path in sorted(folder.iterdir()):
+    for path in sorted(folder.iterdir()) if folder.is_dir() else []:
         number = re.search(r"([0-9]+)$", path.stem)
         if path.suffix.lower() in (".txt", ".npy") and number is not None:
             if int(number[1]) in clouds:
                 raise InputError(f"{path}: {clouds[int(number[1])].name} is of the same frame; take one of them out")
             clouds[int(number[1])] = path
     if not clouds:
-        raise InputError(f"{folder}: holds no point_cloud_<number>.txt or .npy")
+        raise InputError(f"{folder}: holds no point_cloud_<number>.txt or .npy, which would have brought the points")
     return clouds
 
 
 def _read_cloud(path: Path) -> NDArray[np.float64]:
     """Read world points (N, 3). An empty text file has none."""
     if path.suffix.lower() == ".txt":
-        with reading(path), open_file(path) as file:
-            if not file.read(1):
-                return np.zeros((0, 3))
-        return read_number_rows(path, 3, "x y z", "the point files beside tracker.path", more=True).values
+        return read_number_rows(path, 3, "x y z", "the point files beside tracker.path", more=True, least=0).values
     xyz = read_npy_points(path)
     bad = np.flatnonzero(~(np.abs(xyz) <= LARGEST).all(axis=1))
     if len(bad):

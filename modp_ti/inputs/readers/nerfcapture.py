@@ -1,10 +1,8 @@
-"""Captures of NeRFCapture: transforms.json, whose images are named without their suffix."""
+"""Kind `nerfcapture`: captures of NeRFCapture, a transforms.json whose images are named without their suffix."""
 
 from __future__ import annotations
 
 from typing import Any, ClassVar, Literal
-
-from pydantic import Field
 
 from modp_ti.files.errors import InputError
 from modp_ti.files.file_tree import FileTree
@@ -15,6 +13,7 @@ from modp_ti.inputs.capture import (
     checked_time,
     opengl_pose,
     plausible_camera,
+    read_object,
 )
 from modp_ti.inputs.capture_reader import CaptureSettings
 
@@ -23,12 +22,11 @@ KEYS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
 
 
 class NerfCaptureSettings(CaptureSettings):
-    """A capture of NeRFCapture."""
+    """A capture of NeRFCapture, a folder or zip."""
 
-    source_kind: ClassVar[str] = "nerfcapture"
     holds: ClassVar[str] = "transforms.json and images/0.png, images/0.depth.png, ..."
 
-    kind: Literal["nerfcapture"] = Field(default="nerfcapture", description="a capture of NeRFCapture, a folder or zip")
+    kind: Literal["nerfcapture"] = "nerfcapture"
 
     @classmethod
     def recognises(cls, tree: FileTree) -> bool:
@@ -36,45 +34,26 @@ class NerfCaptureSettings(CaptureSettings):
 
     @classmethod
     def read(cls, tree: FileTree) -> Capture:
-        """Read the frames of a capture in the order of their times.
-
-        Its depth pictures are not used: they have 8 bits.
-
-        Raises:
-            InputError: If the file is malformed, or no frame has an image.
-        """
-        where = str(tree.path / FILE)
-        data = tree.read_json(FILE)
-        entries = data.get("frames") if isinstance(data, dict) else None
-        if not isinstance(entries, list) or not entries:
-            raise InputError(f"{where}: holds no list of `frames`; it is no transforms.json")
-        found = [_frame(tree, data, entry, f"{where}: frame {n}") for n, entry in enumerate(entries)]
+        """Read the frames of a capture in the order of their times. Its depth pictures of 8 bits are not used."""
+        data = read_object(tree, FILE, "frames")
+        found = [_frame(tree, {**data, **entry}, n) for n, entry in enumerate(data["frames"])]
         frames = sorted((frame for frame in found if frame is not None), key=lambda frame: frame.time)
-        if not frames:
-            raise InputError(f"{where}: none of its {len(entries)} frames has an image in {tree.path / 'images'}")
-        images = [frame.image for frame in frames]
-        twice = next(
-            (name for name, other in zip(sorted(images), sorted(images)[1:], strict=False) if name == other), None
-        )
-        if twice is not None:
-            raise InputError(f"{where}: two frames have the image {twice}")
-        notes = [f"{tree.path}: is a capture of NeRFCapture; its depth pictures have 8 bits and are not used"]
-        if len(frames) < len(entries):
-            notes.append(f"{len(entries) - len(frames)} of {len(entries)} frames of {FILE} have no image: skipped")
+        if not frames or len({frame.image for frame in frames}) < len(frames):
+            raise InputError(f"{tree.path / FILE}: none of its {len(found)} frames has an image, or two have the same")
+        notes = [f"{tree.path}: its depth pictures have 8 bits and are not used"]
+        if len(frames) < len(found):
+            notes.append(f"{len(found) - len(frames)} of {len(found)} frames of {FILE} have no image: skipped")
         return Capture(tree, FILE, frames, notes)
 
 
-def _frame(tree: FileTree, data: dict[str, Any], entry: Any, where: str) -> CapturedFrame | None:
-    """Return a frame; None if its image does not exist."""
-    name = entry.get("file_path") if isinstance(entry, dict) else None
-    if not isinstance(name, str):
-        raise InputError(f"{where} has no `file_path`")
-    name = name.replace("\\", "/").removeprefix("./")
+def _frame(tree: FileTree, values: dict[str, Any], n: int) -> CapturedFrame | None:
+    """Return a frame of the file's keys, overridden by its own; None if its image does not exist."""
+    where = f"{tree.path / FILE}: frame {n}"
+    name = values["file_path"].replace("\\", "/").removeprefix("./")
     image = next((each for each in (name, f"{name}.png", f"{name}.jpg") if tree.has(each)), None)
     if image is None:
         return None
-    values = {**data, **entry}
     fx, fy, cx, cy, w, h = (checked_numbers(values.get(key), 1, f"{where}: `{key}`")[0] for key in KEYS)
     camera = plausible_camera(fx, fy, cx, cy, (w, h), where)
-    T = opengl_pose(entry.get("transform_matrix"), where)
-    return CapturedFrame(image, checked_time(entry.get("timestamp"), f"{where}: `timestamp`"), camera, T)
+    T = opengl_pose(values.get("transform_matrix"), where)
+    return CapturedFrame(image, checked_time(values.get("timestamp"), f"{where}: `timestamp`"), camera, T)

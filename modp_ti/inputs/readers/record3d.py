@@ -1,13 +1,13 @@
-"""Captures of Record3D: the archive `.r3d`, unpacked or not, and the export of EXR and RGB files."""
+"""Kind `record3d`: captures of Record3D, the archive `.r3d`, unpacked or not, and the export of EXR and RGB files."""
 
 from __future__ import annotations
 
 import struct
+from dataclasses import replace
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from modp_ti.files.errors import InputError
 from modp_ti.files.file_tree import FileTree
@@ -19,9 +19,11 @@ from modp_ti.inputs.capture import (
     checked_numbers,
     checked_time,
     depth_files,
+    numbered,
     opengl_pose,
-    picture_size,
     plausible_camera,
+    read_object,
+    size_of_pictures,
 )
 from modp_ti.inputs.capture_reader import DepthCaptureSettings
 
@@ -38,14 +40,11 @@ INSTALL = "its depths need lzfse: pip install 'modp-ti[record3d]'"
 
 
 class Record3dSettings(DepthCaptureSettings):
-    """A capture of Record3D."""
+    """A capture of Record3D, `.r3d` or its export of EXR and RGB files."""
 
-    source_kind: ClassVar[str] = "record3d"
     holds: ClassVar[str] = "metadata and rgbd/0.jpg, ..."
 
-    kind: Literal["record3d"] = Field(
-        default="record3d", description="a capture of Record3D, `.r3d` or its export of EXR and RGB files"
-    )
+    kind: Literal["record3d"] = "record3d"
 
     @classmethod
     def recognises(cls, tree: FileTree) -> bool:
@@ -53,81 +52,51 @@ class Record3dSettings(DepthCaptureSettings):
 
     @classmethod
     def read(cls, tree: FileTree) -> Capture:
-        """Read the frames of a capture. Frame N is `rgbd/N.jpg`, with row N of the metadata.
-
-        Raises:
-            InputError: If the metadata are missing or malformed.
-        """
+        """Read the frames of a capture. Frame N is `rgbd/N.jpg`, with row N of the metadata."""
         origin = next((name for name in METADATA if tree.has(name)), METADATA[0])
         where = str(tree.path / origin)
-        data = tree.read_json(origin)
-        poses = data.get("poses") if isinstance(data, dict) else None
-        if not isinstance(poses, list) or not poses:
-            raise InputError(f"{where}: holds no list of `poses`; it is no metadata of Record3D")
-        rows = np.array([checked_numbers(row, 7, f"{where}: pose {n}") for n, row in enumerate(poses)])
+        data = read_object(tree, origin, "poses")
+        count = len(data["poses"])
+        rows = np.array([checked_numbers(row, 7, f"{where}: pose {n}") for n, row in enumerate(data["poses"])])
         T_world_camera = poses_of_quaternions(rows[:, 4:], rows[:, :4], lambda n: f"{where}: pose {n}")
-        coefficients = _coefficients(data, len(poses), where)
-        times = _times(data, len(poses), where)
-        pictures = {n: name for n, name in sorted(_pictures(tree).items()) if n < len(poses)}
+        K = checked_numbers(data.get("K"), 9, f"{where}: `K`")  # column by column
+        coefficients = _of_each(data, "perFrameIntrinsicCoeffs", [[K[0], K[4], K[6], K[7]]] * count)
+        fps = checked_numbers(data.get("fps", 60), 1, f"{where}: `fps`")[0]
+        times = _of_each(data, "frameTimestamps", [n / fps for n in range(count)])
+        pictures = {n: name for n, name in _pictures(tree).items() if n < count}
         if not pictures:
-            raise InputError(f"{tree.path}: holds no picture {FOLDERS[0]}/0.jpg, ... of its {len(poses)} poses")
-        size = _size(tree, next(iter(pictures.values())), data, where)
+            raise InputError(f"{tree.path}: holds no picture {FOLDERS[0]}/0.jpg, ... of its {count} poses")
+        width, height = (checked_numbers(data.get(key), 1, f"{where}: `{key}`")[0] for key in ("w", "h"))
+        if size_of_pictures(tree, pictures.values()) == (height, width):  # in some captures exchanged
+            width, height = height, width
         frames = []
         for n, name in pictures.items():
             stem = name.rpartition(".")[0]
             depth, confidence = depth_files(tree, f"{stem}.depth", f"{stem}.conf")
             if depth is None:
                 depth, confidence = depth_files(tree, f"depth/{n}.exr", f"confidence/{n}.png")
-            camera = plausible_camera(*coefficients[n], size, f"{where}: intrinsics of frame {n}")
+            fx, fy, cx, cy = checked_numbers(coefficients[n], 4, f"{where}: perFrameIntrinsicCoeffs {n}")
+            camera = plausible_camera(fx, fy, cx, cy, (width, height), f"{where}: intrinsics of frame {n}")
             T = opengl_pose(T_world_camera[n], f"{where}: pose {n}")
-            frames.append(CapturedFrame(name, times[n], camera, T, depth=depth, confidence=confidence))
-        notes = [f"{tree.path}: is a capture of Record3D"]
-        depth_size = tuple(data.get(key) for key in ("dw", "dh"))
+            time = checked_time(times[n], f"{where}: frameTimestamps {n}")
+            frames.append(CapturedFrame(name, time, camera, T, depth=depth, confidence=confidence))
+        notes, depth_size = [], tuple(data.get(key) for key in ("dw", "dh"))
         packed = any(frame.depth is not None and frame.depth.endswith(".depth") for frame in frames)
         if packed and not _can_unpack():
-            frames = [CapturedFrame(f.image, f.time, f.camera, f.T_camera_world) for f in frames]
+            frames = [replace(frame, depth=None) for frame in frames]
             notes.append(f"{tree.path}: {INSTALL}: points are triangulated instead")
         return Capture(tree, origin, frames, notes, read_depth=lambda tree, frame: _read_depth(tree, frame, depth_size))
 
 
 def _pictures(tree: FileTree) -> dict[int, str]:
     """Names of the pictures by number."""
-    for folder in FOLDERS:
-        found = {}
-        for name in tree.listed(folder):
-            stem, dot, suffix = name[len(folder) + 1 :].rpartition(".")
-            if stem.isascii() and stem.isdecimal() and len(stem) < 9 and (dot + suffix).lower() in SUFFIXES:
-                found.setdefault(int(stem), name)
-        if found:
-            return found
-    return {}
+    return next((found for folder in FOLDERS if (found := numbered(tree, folder, SUFFIXES))), {})
 
 
-def _coefficients(data: dict[str, Any], count: int, where: str) -> list[tuple[float, float, float, float]]:
-    """Return (fx, fy, cx, cy) [px] of each frame."""
-    each = data.get("perFrameIntrinsicCoeffs")
-    if isinstance(each, list) and len(each) >= count:
-        rows = [checked_numbers(row, 4, f"{where}: perFrameIntrinsicCoeffs {n}") for n, row in enumerate(each[:count])]
-    else:
-        K = checked_numbers(data.get("K"), 9, f"{where}: `K`")  # column by column
-        rows = [[K[0], K[4], K[6], K[7]]] * count
-    return [(fx, fy, cx, cy) for fx, fy, cx, cy in rows]
-
-
-def _times(data: dict[str, Any], count: int, where: str) -> list[float]:
-    each = data.get("frameTimestamps")
-    if isinstance(each, list) and len(each) >= count:
-        return [checked_time(time, f"{where}: frameTimestamps {n}") for n, time in enumerate(each[:count])]
-    (fps,) = checked_numbers(data.get("fps", 60), 1, f"{where}: `fps`")
-    if not 1e-3 <= fps <= 1e6:
-        raise InputError(f"{where}: `fps` is {fps:g}; the file is damaged")
-    return [n / fps for n in range(count)]
-
-
-def _size(tree: FileTree, picture: str, data: dict[str, Any], where: str) -> tuple[float, float]:
-    """Return the size (width, height) of the pictures. In some captures `w` and `h` are exchanged."""
-    width, height = (checked_numbers(data.get(key), 1, f"{where}: `{key}`")[0] for key in ("w", "h"))
-    return (height, width) if picture_size(tree, picture) == (height, width) else (width, height)
+def _of_each(data: dict[str, Any], key: str, default: list[Any]) -> list[Any]:
+    """Return the values of the frames under a key; the default in captures of older versions, which lack them."""
+    each = data.get(key)
+    return each if isinstance(each, list) and len(each) >= len(default) else default
 
 
 def _can_unpack() -> bool:

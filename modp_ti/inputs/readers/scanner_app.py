@@ -1,11 +1,9 @@
-"""Captures of 3D Scanner App, exported as "All Data"."""
+"""Kind `scanner_app`: captures of 3D Scanner App, exported as "All Data"."""
 
 from __future__ import annotations
 
 import re
 from typing import ClassVar, Literal
-
-from pydantic import Field
 
 from modp_ti.files.errors import InputError
 from modp_ti.files.file_tree import FileTree
@@ -16,8 +14,9 @@ from modp_ti.inputs.capture import (
     checked_time,
     depth_files,
     opengl_pose,
-    picture_size,
     plausible_camera,
+    read_object,
+    size_of_pictures,
 )
 from modp_ti.inputs.capture_reader import DepthCaptureSettings
 from modp_ti.inputs.depth_maps import millimetre_png
@@ -28,54 +27,39 @@ CONFIDENT = 2  # of 0, 1 and 2
 
 
 class ScannerAppSettings(DepthCaptureSettings):
-    """A capture of 3D Scanner App."""
+    """A capture of 3D Scanner App, exported as "All Data"."""
 
-    source_kind: ClassVar[str] = "scanner_app"
     holds: ClassVar[str] = "frame_00000.json, frame_00000.jpg, ..."
 
-    kind: Literal["scanner_app"] = Field(
-        default="scanner_app", description='a capture of 3D Scanner App, exported as "All Data"'
-    )
+    kind: Literal["scanner_app"] = "scanner_app"
 
     @classmethod
     def recognises(cls, tree: FileTree) -> bool:
         names = tree.listed()
-        return any(FRAME.fullmatch(name) for name in names) and any(
-            re.fullmatch(r"frame_[0-9]+\.jpg", n) for n in names
-        )
+        return any(map(FRAME.fullmatch, names)) and any(map(PICTURE.fullmatch, names))
 
     @classmethod
     def read(cls, tree: FileTree) -> Capture:
-        """Read the frames of a capture: the files `frame_*.json` with a picture of the same name.
-
-        Raises:
-            InputError: If a file is malformed, or none has a picture.
-        """
-        files = [match for match in map(FRAME.fullmatch, tree.listed()) if match]
-        posed = [(match[0], match[1]) for match in files if tree.has(f"frame_{match[1]}.jpg")]
+        """Read the frames of a capture: the files `frame_*.json` with a picture of the same name."""
+        numbers = [match[1] for match in map(FRAME.fullmatch, tree.listed()) if match]
+        posed = [number for number in numbers if tree.has(f"frame_{number}.jpg")]
         if not posed:
-            raise InputError(f"{tree.path}: none of its {len(files)} files frame_00000.json, ... has a picture .jpg")
-        size = _size(tree, f"frame_{posed[0][1]}.jpg")
+            raise InputError(f"{tree.path}: none of its {len(numbers)} files frame_00000.json, ... has a picture .jpg")
+        size = size_of_pictures(tree, (f"frame_{number}.jpg" for number in posed))
+        if abs(size[0] * SIZE[1] - size[1] * SIZE[0]) > SIZE[0]:  # of another shape: reported as such
+            size = SIZE
         frames = []
-        for name, number in posed:
-            where = f"{tree.path / name}"
-            data = tree.read_json(name)
-            if not isinstance(data, dict):
-                raise InputError(f"{where}: is no frame of 3D Scanner App")
+        for number in posed:
+            name = f"frame_{number}.json"
+            where, data = f"{tree.path / name}", read_object(tree, name, "cameraPoseARFrame")
             K = checked_numbers(data.get("intrinsics"), 9, f"{where}: `intrinsics`")
             camera = plausible_camera(K[0], K[4], K[2], K[5], SIZE, where).resized(*size)
-            pose = checked_numbers(data.get("cameraPoseARFrame"), 16, f"{where}: `cameraPoseARFrame`")
-            T, time = opengl_pose(pose, where), checked_time(data.get("time"), f"{where}: `time`")
+            T = opengl_pose(data["cameraPoseARFrame"], f"{where}: `cameraPoseARFrame`")
+            time = checked_time(data.get("time"), f"{where}: `time`")
             depth, confidence = depth_files(tree, f"depth_{number}.png", f"conf_{number}.png")
             frames.append(CapturedFrame(f"frame_{number}.jpg", time, camera, T, depth=depth, confidence=confidence))
         frames.sort(key=lambda frame: frame.time)
-        notes = [f"{tree.path}: is a capture of 3D Scanner App"]
-        if len(posed) < len(files):
-            notes.append(f"{len(posed)} of its {len(files)} poses have a picture; the app keeps every third")
-        return Capture(tree, posed[0][0], frames, notes, read_depth=millimetre_png(CONFIDENT))
-
-
-def _size(tree: FileTree, picture: str) -> tuple[int, int]:
-    """Return the size (width, height) of the pictures, `SIZE` or of the same shape."""
-    width, height = picture_size(tree, picture) or SIZE  # what cannot be read is reported when the images are opened
-    return (width, height) if abs(width * SIZE[1] - height * SIZE[0]) <= SIZE[0] else SIZE
+        notes = []
+        if len(posed) < len(numbers):
+            notes.append(f"{len(posed)} of its {len(numbers)} poses have a picture; the app keeps every third")
+        return Capture(tree, f"frame_{posed[0]}.json", frames, notes, read_depth=millimetre_png(CONFIDENT))

@@ -15,12 +15,12 @@ from modp_ti.files import read_text
 from modp_ti.files.atomic import replace_text
 from modp_ti.files.errors import InputError, UnreadableImageError
 from modp_ti.files.run_folder import appearing
-from modp_ti.inputs.given_poses import selected_frames
-from modp_ti.inputs.opening import open_source, require_pinhole
-from modp_ti.inputs.protocol import Progress
+from modp_ti.inputs.opening import require_pinhole
+from modp_ti.inputs.posed_recording import PosedRecording
+from modp_ti.inputs.protocol import Progress, Tracker
 from modp_ti.inputs.reader import TrackerSettings
-from modp_ti.inputs.readers.colmap import open_model
-from modp_ti.inputs.replay import ReplayedTracker, Unreadable
+from modp_ti.inputs.readers.colmap import pose_by_model
+from modp_ti.inputs.replay import Unreadable
 from modp_ti.inputs.sources import FrameReader, ImageSource, Intrinsics
 
 if TYPE_CHECKING:
@@ -33,14 +33,11 @@ METHOD = "2"
 
 
 class SfmSettings(TrackerSettings):
-    """Structure from motion on the images, before the first frame is mapped."""
+    """Structure from motion by pycolmap on the images alone; the model is kept in the output folder."""
 
     places_panoramas: ClassVar[bool] = True
 
-    kind: Literal["sfm"] = Field(
-        default="sfm",
-        description="structure from motion by pycolmap on the images alone; the model is kept in the output folder",
-    )
+    kind: Literal["sfm"] = "sfm"
     order: Literal["sequential", "unordered"] = Field(
         default="sequential",
         description="`sequential`: the images follow each other along a path, and each is matched with its neighbours "
@@ -55,30 +52,26 @@ class SfmSettings(TrackerSettings):
     overlap: int = Field(default=10, ge=1, description="number of next images that an image is matched with")
     features: int = Field(default=4000, ge=100, description="largest number of features of an image")
 
-    def open(self, scene: SceneConfig, progress: Progress | None = None) -> ReplayedTracker:
+    def open(self, scene: SceneConfig, progress: Progress | None = None) -> Tracker:
         """Reconstruct the selected images, or take the model of an earlier run on the same images and settings.
 
         The faces of a panorama are placed together, as a rig. The model is in `sfm` in the output folder: a COLMAP
         model with a fingerprint. Fewer than three images that belong together raise InputError.
         """
-        source, folder, seed = scene.source, scene.output / "sfm", scene.seed
-        images = open_source(source)
-        reader = FrameReader(images, source)
-        names = selected_frames(images, source)
+        recording, folder = PosedRecording(scene.source, progress), scene.output / "sfm"
+        images, names = recording.images, recording.selected
         if images.intrinsics is None:
-            require_pinhole(images, source, names[0])
-        made_of = _fingerprint(images, source, self, names, seed)
-        kept = _kept(folder) == made_of
-        if not kept:
+            require_pinhole(images, scene.source, names[0])
+        made_of = _fingerprint(images, scene.source, self, names, scene.seed)
+        if _kept(folder) == made_of:
+            recording.notes.append(f"structure from motion: {folder} is of these images and settings: used again")
+        else:
+            views, reader = [view for name in names for view in images.views(name)], FrameReader(images, scene.source)
             with appearing(folder.parent, (folder.name,)) as staged:
-                views = [view for name in names for view in images.views(name)]
-                _reconstruct(reader, views, self, staged / folder.name, seed, progress or _silent)
+                _reconstruct(reader, views, self, staged / folder.name, scene.seed, progress or _silent)
                 replace_text(staged / folder.name / MADE_OF, made_of)
-        images.close()
-        opened = open_model(source, folder, progress, upright=True)
-        if kept:
-            opened.notes.append(f"structure from motion: {folder} is of these images and settings, and is used again")
-        return opened
+        pose_by_model(recording, folder, upright=True)
+        return recording.tracker()
 
 
 def _reconstruct(

@@ -15,15 +15,13 @@ if TYPE_CHECKING:
 
 
 class SocketSettings(TrackerSettings):
-    """Another program that sends frames and poses through a socket."""
+    """Another program that sends frames and poses (docs/tracker_server.md)."""
 
     needs_source: ClassVar[bool] = False
     brings_cameras: ClassVar[bool] = True
     is_live: ClassVar[bool] = True
 
-    kind: Literal["socket"] = Field(
-        default="socket", description="another program that sends frames and poses (docs/tracker_server.md)"
-    )
+    kind: Literal["socket"] = "socket"
     address: str | None = Field(
         default=None, description="host:port of the server; empty: 127.0.0.1:7007, which only this machine can reach"
     )

@@ -1,24 +1,23 @@
-"""Captures of Stray Scanner: a video, and a table with a pose for each of its frames."""
+"""Kind `stray_scanner`: captures of Stray Scanner, a video and a table with a pose for each of its frames."""
 
 from __future__ import annotations
 
-import io
 from typing import ClassVar, Literal
 
 import numpy as np
-from pydantic import Field
 
 from modp_ti.files.errors import InputError
 from modp_ti.files.file_tree import FileTree
-from modp_ti.files.reading import limited_lines, reading
 from modp_ti.files.trajectory import poses_of_quaternions
 from modp_ti.inputs.capture import (
+    LARGEST_TIME,
     Capture,
     CapturedFrame,
-    checked_numbers,
     depth_files,
     opencv_pose,
     plausible_camera,
+    read_lines,
+    read_numbers,
 )
 from modp_ti.inputs.capture_reader import DepthCaptureSettings
 from modp_ti.inputs.depth_maps import millimetre_png
@@ -33,10 +32,9 @@ CONFIDENT = 2  # of 0, 1 and 2
 class StrayScannerSettings(DepthCaptureSettings):
     """A capture of Stray Scanner."""
 
-    source_kind: ClassVar[str] = "stray_scanner"
     holds: ClassVar[str] = "rgb.mp4 and odometry.csv"
 
-    kind: Literal["stray_scanner"] = Field(default="stray_scanner", description="a capture of Stray Scanner")
+    kind: Literal["stray_scanner"] = "stray_scanner"
 
     @classmethod
     def recognises(cls, tree: FileTree) -> bool:
@@ -44,61 +42,31 @@ class StrayScannerSettings(DepthCaptureSettings):
 
     @classmethod
     def read(cls, tree: FileTree) -> Capture:
-        """Read the frames of a capture. Row n of the table belongs to frame n of the video.
-
-        Raises:
-            InputError: If the table is missing or malformed, with its line.
-        """
+        """Read the frames of a capture. Row n of the table belongs to frame n of the video."""
         where = tree.path / TABLE
-        header, rows, lines = _table(tree, TABLE)
-        missing = [name for name in POSE if name not in header]
-        if missing or not rows:
-            raise InputError(f"{where}: " + (f"has no column {missing[0]}" if missing else "holds no pose"))
-        column = {name: place for place, name in enumerate(header)}
-        poses = np.array(
-            [_numbers(row, [column[name] for name in POSE], f"{where}:{n}") for row, n in zip(rows, lines, strict=True)]
-        )
-        T_world_camera = poses_of_quaternions(poses[:, 2:5], poses[:, 5:9], lambda n: f"{where}:{lines[n]}")
-        own = all(name in column for name in INTRINSICS)
-        shared = None if own else _matrix(tree)
+        (_, head), *lines = read_lines(tree, TABLE)
+        names = [name.strip() for name in head.split(",")]
+        column = {name: names.index(name) for name in (*POSE, *(INTRINSICS if "fx" in names else ()))}  # by its place
+        table = {name: np.zeros(len(lines)) for name in column}
+        for n, (number, line) in enumerate(lines):
+            words = line.split(",")
+            for name, place in column.items():
+                table[name][n] = float(words[place])
+                if not abs(table[name][n]) <= LARGEST_TIME:
+                    raise InputError(f"{where}:{number}: `{name}` is {words[place]}; take the line out")
+        if "fx" in table:
+            focal = np.stack([table[name] for name in INTRINSICS], axis=1)
+        else:  # one matrix for all frames
+            K = read_numbers(tree, MATRIX, 3, "a row of the camera matrix")
+            focal = np.tile([K[0, 0], K[1, 1], K[0, 2], K[1, 2]], (len(lines), 1))
+        place, turn = (np.stack([table[name] for name in some], axis=1) for some in (POSE[2:5], POSE[5:9]))
+        T_world_camera = poses_of_quaternions(place, turn, lambda n: f"{where}:{lines[n][0]}")
         frames = []
-        for n, (row, line, pose) in enumerate(zip(rows, lines, poses, strict=True)):
-            fx, fy, cx, cy = shared or _numbers(row, [column[name] for name in INTRINSICS], f"{where}:{line}")
+        for n, (line, _) in enumerate(lines):
+            fx, fy, cx, cy = focal[n].tolist()
             camera = plausible_camera(fx, fy, cx, cy, SIZE, f"{where}:{line}")
-            T = opencv_pose(T_world_camera[n], f"{where}:{line}")
-            number = f"{int(min(max(pose[1], 0), 999_999)):06d}.png"
+            number = f"{int(np.clip(table['frame'][n], 0, 999_999)):06d}.png"
             depth, confidence = depth_files(tree, f"depth/{number}", f"confidence/{number}")
-            frames.append(CapturedFrame(str(n), float(pose[0]), camera, T, depth=depth, confidence=confidence))
-        notes = [f"{tree.path}: is a capture of Stray Scanner"]
-        return Capture(tree, TABLE, frames, notes, video=VIDEO, read_depth=millimetre_png(CONFIDENT))
-
-
-def _table(tree: FileTree, name: str) -> tuple[list[str], list[list[str]], list[int]]:
-    """Read a table: the names of its columns, and the words of each row with its line."""
-    with reading(tree.path / name, " (source.path)"):
-        lines = list(limited_lines(io.StringIO(tree.read_text(name))))
-    words = [[word.strip() for word in line.split(",")] for line in lines]
-    numbers = [n for n, row in enumerate(words) if n and any(row)]
-    return (words[0] if words else []), [words[n] for n in numbers], [n + 1 for n in numbers]
-
-
-def _numbers(row: list[str], places: list[int], where: str) -> list[float]:
-    try:
-        values = [float(row[place]) for place in places]
-    except (ValueError, IndexError):
-        raise InputError(f"{where}: not a row of numbers: {', '.join(POSE)}, ...") from None
-    if not (np.abs(values) <= 1e12).all():
-        raise InputError(f"{where}: holds NaN or numbers beyond 1e12; take the line out, or copy the file again")
-    return values
-
-
-def _matrix(tree: FileTree) -> list[float]:
-    """Return fx, fy, cx and cy of the file that holds one matrix for all frames."""
-    with reading(tree.path / MATRIX, " (source.path)"):
-        text = tree.read_text(MATRIX).replace(",", " ").split()
-    try:
-        values = [float(word) for word in text]
-    except ValueError:
-        values = []
-    K = checked_numbers(values, 9, f"{tree.path / MATRIX}: the matrix")
-    return [K[0], K[4], K[2], K[5]]
+            T, time = opencv_pose(T_world_camera[n], f"{where}:{line}"), float(table["timestamp"][n])
+            frames.append(CapturedFrame(str(n), time, camera, T, depth=depth, confidence=confidence))
+        return Capture(tree, TABLE, frames, video=VIDEO, read_depth=millimetre_png(CONFIDENT))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import re
 from collections.abc import Sequence
@@ -15,20 +14,16 @@ from fields.geometry.camera import PinholeCamera
 from modp_ti.files import LARGEST, input_lines
 from modp_ti.files.errors import InputError
 from modp_ti.files.file_tree import FileTree
-from modp_ti.inputs.given_poses import found_file
-from modp_ti.inputs.protocol import Progress
+from modp_ti.inputs.posed_recording import PosedRecording
 from modp_ti.inputs.reader import TrajectorySettings
-from modp_ti.inputs.replay import ReplayedTracker
 from modp_ti.inputs.sources.distortion import NO_DISTORTION, Distortion
 from modp_ti.inputs.sources.intrinsics import Intrinsics
 from modp_ti.inputs.sources.listed_images import ListedImages
-from modp_ti.inputs.timed_poses import replay_trajectory
 
 if TYPE_CHECKING:
-    from modp_ti.config.settings import SceneConfig, SourceSettings
+    from modp_ti.config.settings import SourceSettings
 
 NAMES = ("groundtruth.txt", "trajectory.txt", "CameraTrajectory.txt", "KeyFrameTrajectory.txt")
-
 LISTING = "rgb.txt"
 HINT = "; it should list the images (source.path)"
 WIDTH, HEIGHT = 640, 480
@@ -43,24 +38,21 @@ CAMERA_NAME = re.compile(r"(?:freiburg|fr)[-_ ]?([123])(?![0-9])", re.IGNORECASE
 
 
 class TumSettings(TrajectorySettings):
-    """A trajectory in TUM's format."""
+    """A trajectory in TUM format."""
 
     source_kind: ClassVar[str] = "tum_rgbd"
     pose_files: ClassVar[Sequence[str]] = ("groundtruth.txt", "*Trajectory.txt")
 
-    kind: Literal["tum"] = Field(default="tum", description="a trajectory in TUM format")
+    kind: Literal["tum"] = "tum"
     path: Path | None = Field(
         default=None,
         description="the file or its folder; empty: `groundtruth.txt`, `trajectory.txt`, `CameraTrajectory.txt` or "
         "`KeyFrameTrajectory.txt`, in the images' folder or next to it",
     )
 
-    def open(self, scene: SceneConfig, progress: Progress | None = None) -> ReplayedTracker:
-        """Open the images that have a pose within `max_difference` of their time, in the source's order."""
-        place = scene.source.require_path()
-        guesses = [folder / name for folder in (place, place.parent) for name in NAMES]
-        file = found_file(self.path, guesses, "a trajectory in TUM's format")
-        return replay_trajectory(file, scene.source, self, progress)
+    def add_poses(self, recording: PosedRecording) -> None:
+        """Give images the pose within `max_difference` of their time."""
+        self.give_trajectory(recording, self.found(recording.source, NAMES, "a trajectory in TUM's format"))
 
     @classmethod
     def recognises(cls, tree: FileTree) -> bool:
@@ -87,8 +79,7 @@ class TumSettings(TrajectorySettings):
 def _camera(path: Path, listing: Path) -> tuple[Intrinsics | None, str]:
     """Return the benchmark's camera that the folder or a comment of the listing names, and a remark."""
     comments = (line for line in input_lines(listing, HINT) if line.startswith("#"))
-    named = CAMERA_NAME.search(path.resolve().name)
-    found = named or next(filter(None, map(CAMERA_NAME.search, comments)), None)
+    found = next(filter(None, map(CAMERA_NAME.search, (path.resolve().name, *comments))), None)
     if found is None:
         return None, (
             f"{path} names none of the benchmark's cameras (freiburg1, freiburg2, freiburg3 or fr1, fr2, fr3): "
@@ -101,34 +92,20 @@ def _camera(path: Path, listing: Path) -> tuple[Intrinsics | None, str]:
 
 
 def _read_listing(file: Path) -> list[tuple[float, str]]:
-    """Read time [s] and path of each entry of a listing such as `rgb.txt`. `#` starts a comment.
-
-    Raises:
-        InputError: If the listing is missing, empty or malformed, times are not strictly increasing, or a path is
-            listed twice. The message names the line.
-    """
-    entries: list[tuple[float, str]] = []
-    first_line: dict[str, int] = {}
+    """Read time [s] and path of each line. Times must increase, and paths differ."""
+    times: dict[str, float] = {}
+    latest = -LARGEST
     for number, line in enumerate(input_lines(file, HINT), 1):
         words = line.partition("#")[0].split(maxsplit=1)
         if not words:
             continue
-        where = f"{file}:{number}"
-        if len(words) != 2:
-            raise InputError(f"{where}: must be a time stamp and a path, not {line.strip()!r}")
-        name = Path(words[1].strip()).as_posix()
         try:
-            time = float(words[0])
-        except ValueError:
-            time = math.nan
-        if not abs(time) <= LARGEST:
-            raise InputError(f"{where}: the time stamp {words[0]!r} is no finite number of seconds")
-        if entries and time <= entries[-1][0]:
-            raise InputError(f"{where}: time stamp {words[0]} is not later than the one before; sort the listing")
-        if name in first_line:
-            raise InputError(f"{where}: {name} is listed before, in line {first_line[name]}; take one of them out")
-        first_line[name] = number
-        entries.append((time, name))
-    if not entries:
+            time, name = float(words[0]), Path(words[1].strip()).as_posix()
+        except (ValueError, IndexError):
+            raise InputError(f"{file}:{number}: must be a time stamp and a path, not {line.strip()[:60]!r}") from None
+        if not latest < time < LARGEST or name in times:
+            raise InputError(f"{file}:{number}: times must increase and paths differ: sort the listing without doubles")
+        times[name] = latest = time
+    if not times:
         raise InputError(f"{file}: lists no image; its lines must be a time stamp and a path")
-    return entries
+    return [(time, name) for name, time in times.items()]

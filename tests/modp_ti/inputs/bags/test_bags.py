@@ -13,10 +13,10 @@ from scipy.spatial.transform import Rotation
 
 from modp_ti.config.settings import SourceSettings
 from modp_ti.files.errors import InputError
+from modp_ti.inputs import posed_recording
 from modp_ti.inputs.bags import has_poses, is_bag
 from modp_ti.inputs.bare_recording import recorded_scene
 from modp_ti.inputs.opening import open_source
-from modp_ti.inputs.readers import bag as bag_tracker
 from tests.bags import BODY_CAMERA, FORMS, START, STEP, Messages, recording, write_bag
 
 PLANE = np.stack(np.meshgrid(np.linspace(-3, 3, 40), np.linspace(-3, 3, 40), [0.0]), axis=-1).reshape(-1, 3)
@@ -25,7 +25,7 @@ PLANE = np.stack(np.meshgrid(np.linspace(-3, 3, 40), np.linspace(-3, 3, 40), [0.
 @pytest.fixture
 def untriangulated(monkeypatch):
     """Triangulation would take seconds."""
-    monkeypatch.setattr(bag_tracker, "triangulated_frames", lambda _, frames, *__: frames)
+    monkeypatch.setattr(posed_recording, "triangulated_frames", lambda _, frames, *__: frames)
 
 
 def place(form: str) -> str:

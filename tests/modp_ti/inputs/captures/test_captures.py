@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from modp_ti.commands import app as cli
 from modp_ti.config.settings import SourceSettings
 from modp_ti.files.errors import InputError
-from modp_ti.inputs import capture_reader
+from modp_ti.inputs import posed_recording
 from modp_ti.inputs.bare_recording import recorded_scene
 from modp_ti.inputs.inspection.conventions import STATED
 from modp_ti.inputs.inspection.geometry import judge_geometry, measure_geometry
@@ -122,7 +122,7 @@ def test_every_kind_is_written_by_a_test():
 @pytest.mark.parametrize("kind", WRITERS)
 def test_a_wrong_axes_convention_is_found_by_check(kind, views, tmp_path, monkeypatch, opened):
     """The images tell it: points of depth maps fit the poses whatever these are. Triangulation would take seconds."""
-    monkeypatch.setattr(capture_reader, "triangulated_frames", lambda _, frames, *__: frames)
+    monkeypatch.setattr(posed_recording, "triangulated_frames", lambda _, frames, *__: frames)
     needs_lzfse(kind)
     flipped = [replace(view, T_world_camera=view.T_world_camera @ OPENGL) for view in views[:4]]
     WRITERS[kind](tmp_path / kind, flipped)

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from modp_ti.inputs import capture_reader, given_poses
+from modp_ti.inputs import posed_recording
 from modp_ti.inputs.depth_maps import read_millimetres
 from modp_ti.inputs.inspection.conventions import STATED
 from modp_ti.inputs.inspection.geometry import measure_geometry
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.real_data
 @pytest.fixture
 def untriangulated(monkeypatch):
     """The poses alone are looked at."""
-    monkeypatch.setattr(capture_reader, "triangulated_frames", lambda _, frames, *__: frames)
+    monkeypatch.setattr(posed_recording, "triangulated_frames", lambda _, frames, *__: frames)
 
 
 def test_points_of_3d_scanner_app_lie_where_another_frame_measures_them(shared_data, opened):
@@ -88,7 +88,7 @@ def test_kitti_drives_forward_as_the_camera_looks(shared_data, tmp_path):
 
 
 def test_cameras_of_tanks_and_temples_look_at_what_they_go_round(shared_data, tmp_path, opened, monkeypatch):
-    monkeypatch.setattr(given_poses, "triangulated_frames", lambda _, frames, *__: frames)
+    monkeypatch.setattr(posed_recording, "triangulated_frames", lambda _, frames, *__: frames)
     for n in range(151):
         cv2.imwrite(str(tmp_path / f"{n + 1:06d}.png"), np.zeros((36, 64, 3), np.uint8))
     log = shared_data("captures") / "tanksandtemples" / "test.log"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from modp_ti.inputs import given_poses
+from modp_ti.inputs import posed_recording
 from modp_ti.inputs.inspection.geometry import judge_geometry, measure_geometry
 from modp_ti.inputs.inspection.survey import survey
 
@@ -38,7 +38,7 @@ def rows(recording, count: int, wrongly=lambda T: T) -> list[str]:
 )
 def test_a_wrong_convention_is_found_by_check(recording, monkeypatch, kind, fault, wrongly):
     """The images tell it. Triangulation, which finds no points with wrong poses, would take seconds."""
-    monkeypatch.setattr(given_poses, "triangulated_frames", lambda _, frames, *__: frames)
+    monkeypatch.setattr(posed_recording, "triangulated_frames", lambda _, frames, *__: frames)
     lines = rows(recording, 12, wrongly) if kind == "matrices" else log(recording, wrongly=wrongly)
     recording.write("poses.txt" if kind == "matrices" else "scene.log", lines)
     found = list(judge_geometry(measure_geometry(survey(recording.open(kind), 4, lambda _: None))))
