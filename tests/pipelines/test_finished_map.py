@@ -1,4 +1,4 @@
-"""A new map goes on with a finished one: it holds the same Gaussians and views, and grows only where nothing is."""
+"""A new map continues a finished one; frames between keyframes are views."""
 
 from __future__ import annotations
 
@@ -13,7 +13,9 @@ from fields.frames.pose_correction import PoseCorrection
 from fields.geometry.se3 import exp_se3
 from fields.map.gaussians import NO_ANCHOR
 from pipelines.online import OnlineMapper
-from pipelines.whole.finished_map import FinishedMap, go_on, placed_by
+from pipelines.pipeline import FrameReport
+from pipelines.settings import MappingSettings
+from pipelines.whole.finished_map import FinishedMap, go_on
 from tests.pipelines.mapped_wall import finished_map, finished_mapper, fresh_mapper
 from tests.pipelines.test_online import SETTINGS
 from tests.pipelines.wall import frame
@@ -72,21 +74,6 @@ def test_what_the_finished_run_has_masked_stays_masked(finished: Finished) -> No
         assert not rows[:14].any()
 
 
-def test_every_gaussian_has_the_first_keyframe_that_shows_it_as_anchor(finished: Finished) -> None:
-    mapper = gone_on(finished)
-    anchors, store = mapper.gaussians.anchors(), mapper.keyframes
-    position = mapper.gaussians.to_numpy()["position"].astype(np.float64)
-    np.testing.assert_array_equal(anchors, placed_by(store, position, mapper.near))
-    assert (anchors != NO_ANCHOR).mean() > 0.95
-    assert [anchor.keyframe for anchor in mapper.densifier.anchors] == list(store)
-    for place in np.unique(anchors[anchors != NO_ANCHOR]):
-        for earlier in range(place):
-            view = store[earlier]
-            local = position[anchors == place] @ view.T_camera_world[:3, :3].T + view.T_camera_world[:3, 3]
-            ahead = local[:, 2] > mapper.near
-            assert not view.camera.contains(view.camera.project(local[ahead])).any()
-
-
 def test_the_voxels_of_the_map_are_taken(finished: Finished) -> None:
     mapper = gone_on(finished)
     assert mapper.densifier.voxels is not None
@@ -120,3 +107,27 @@ def test_a_correction_of_later_frames_leaves_the_finished_map_alone(finished: Fi
     np.testing.assert_array_equal(mapper.gaussians.to_numpy()["position"][old], before)
     for view, T in zip(mapper.keyframes, poses, strict=False):
         np.testing.assert_array_equal(view.T_camera_world, T)
+
+
+def mapped(**keyframes) -> tuple[OnlineMapper, list[FrameReport]]:
+    """Map six frames, of which the first and the fifth are keyframes."""
+    apart = {"covisibility": 0.0, "baseline": 9.0, "max_gap": 3}
+    settings = MappingSettings(optimise={"steps": 20}, densify={"warm_up": 2}, keyframes=apart | keyframes)
+    mapper = fresh_mapper(settings)
+    return mapper, [mapper.process(frame(i)) for i in range(6)]
+
+
+def test_frames_between_keyframes_are_views_that_get_tracked_points_alone() -> None:
+    mapper, reports = mapped(between=2)
+    assert [report.is_keyframe for report in reports] == [i in (0, 4) for i in range(6)]
+    assert [report.keyframes for report in reports] == [1, 1, 1, 1, 2, 2]
+    assert [(view.index, view.is_between) for view in mapper.keyframes] == [(0, False), (2, True), (4, False)]
+    added = np.diff([0, *(report.gaussians for report in reports)])
+    assert added[[1, 2, 3, 5]].max() <= 120 < added[4]
+    optimised, began = mapper.keyframes[1].error, mapper.keyframes[0].error
+    assert optimised < 0.2, f"the new view began with an error of 1, the first keyframe ended with {began}"
+
+
+def test_without_the_setting_keyframes_are_the_only_views() -> None:
+    mapper, _ = mapped()
+    assert [view.index for view in mapper.keyframes] == [0, 4]

@@ -75,12 +75,6 @@ def test_a_shorter_run_keeps_its_shares_but_not_its_waits() -> None:
     assert Schedule.of(OfflineSettings(steps=1)).sh_degree(1) <= 3
 
 
-def test_a_longer_run_lasts_longer_in_all_its_parts() -> None:
-    schedule = Schedule.of(OfflineSettings(steps=60_000))
-    assert rounds(schedule) == list(range(600, 30_000, 100))
-    assert resets(schedule) == [6000, 12_000, 18_000, 24_000]
-
-
 # ---- a map ---------------------------------------------------------------------------------------------------
 
 
@@ -123,12 +117,6 @@ def test_it_begins_with_the_tracked_points_and_grows(mapped: tuple[OfflineMapper
     assert m.renderer.view_renders == before["steps"] == STEPS
     assert before["last"] == len(m.gaussians)
     assert np.abs(m.gaussians.to_numpy()["sh"][:, 9:]).max() > 0  # the third band was reached
-
-
-def test_held_out_frames_are_refused(mapped: tuple[OfflineMapper, dict[str, float]]) -> None:
-    with pytest.raises(ValueError, match="frame 3"):
-        mapped[0].process(frame(3, held_out=True))
-    assert len(mapped[0].keyframes) == 6
 
 
 CODE = """

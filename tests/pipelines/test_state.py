@@ -84,13 +84,6 @@ def test_a_map_restored_at_any_time_ends_as_the_one_that_went_on(states: dict[st
     assert_same(save_state(mapper), states["end"])
 
 
-def test_the_last_passes_go_on_in_their_middle(states: dict[str, MapState]) -> None:
-    assert 0 < states["settling"].numbers["settled"] < states[str(len(STEPS))].numbers["settled"]
-    mapper = restored(states["settling"], EXPOSED)
-    mapper.finish()
-    assert_same(save_state(mapper), states[str(len(STEPS))])
-
-
 def test_a_refinement_goes_on_in_its_middle(states: dict[str, MapState]) -> None:
     mapper = restored(states["middle"], EXPOSED)
     refine(mapper, REFINE, done=MIDDLE)
@@ -116,9 +109,3 @@ def test_a_state_that_does_not_fit_is_refused(states: dict[str, MapState], name:
     arrays = {n: a for n, a in state.arrays.items() if n != name} | ({} if value is None else {name: value})
     with pytest.raises((KeyError, ValueError, IndexError)):
         restored(MapState(arrays, state.numbers), EXPOSED)
-
-
-def test_a_state_without_its_marks_of_voxels_is_refused(states: dict[str, MapState]) -> None:
-    arrays = {name: array for name, array in states["1"].arrays.items() if not name.startswith("voxels.")}
-    with pytest.raises(TypeError, match="restore"):
-        restored(MapState(arrays, states["1"].numbers), EXPOSED)

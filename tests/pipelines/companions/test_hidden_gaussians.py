@@ -74,19 +74,6 @@ def test_a_sweep_in_parts_removes_the_same_once_it_has_seen_all_keyframes(taichi
     assert len(mapper.gaussians) >= 3 * 100
 
 
-def test_a_map_is_never_swept_where_the_settings_say_so(taichi_on_the_cpu: None) -> None:
-    initialise("cpu")
-    settings = SETTINGS.model_copy(update={"densify": SETTINGS.densify.model_copy(update={"min_contribution": 0.0})})
-    mapper = OnlineMapper(settings, 64, 48, seed=1, pace=Sweeping(9))
-    for i in range(2):
-        mapper.process(frame(i))
-    add_behind(mapper, 100.0)
-    renders = mapper.renderer.view_renders
-    mapper.process(frame(2))
-    assert count_behind(mapper, 100.0) == 5
-    assert mapper.renderer.view_renders - renders <= 1 + SETTINGS.views.per_step
-
-
 def sweeps(missing: list[int], already: int = 0, apart: int | None = None) -> dict[int, list[int]]:
     """The keyframes that are swept when each comes, of a growing map without Gaussians.
 
@@ -160,7 +147,3 @@ def test_what_a_keyframe_that_is_left_out_has_placed_stays(taichi_on_the_cpu: No
     mapper.hidden.due = len(mapper.keyframes.selected)
     mapper.hidden.sweep_when_due(mapper.near)
     assert [count_behind(mapper, 100.0), count_behind(mapper, 200.0)] == [5, 0]
-
-
-def test_keyframes_of_a_finished_map_count_as_swept() -> None:
-    assert list(sweeps([0] * 330, already=100)) == [144, 216, 324]

@@ -51,25 +51,6 @@ def test_no_gaussian_reaches_from_one_place_to_the_next(mapper: OnlineMapper, ap
     assert sizes.max() == pytest.approx(largest, rel=0.1)
 
 
-def test_a_size_that_was_limited_stays_when_the_scene_depth_changes(mapper: OnlineMapper) -> None:
-    store, depth, anchor = mapper.keyframes, mapper.keyframes.scene_depth, mapper.gaussians.anchors()
-    state = mapper.gaussians.to_numpy()
-    state["log_scale"][anchor == 0] = np.log(2.0 * depth)
-    mapper.gaussians.load(state | {"anchor": anchor})
-    changed(mapper, [2, 3])
-    for keyframe in store:
-        keyframe.median_depth *= 0.9
-    store.take_in_depths()
-    assert store.scene_depth == pytest.approx(0.9 * depth)
-    assert not changed(mapper, [2, 3])[anchor == 0].any()
-
-
-def test_in_a_map_of_one_place_nothing_is_held(mapper: OnlineMapper) -> None:
-    mapper.keyframes.begins.clear()
-    _, second, strangers, without_anchor = shares(mapper, [2, 3])
-    assert min(second, strangers, without_anchor) > 0.5
-
-
 def test_back_at_a_place_later_views_optimise_what_the_first_ones_placed(mapper: OnlineMapper) -> None:
     mapper.process(frame(4))
     first = mapper.gaussians.anchors() == 0

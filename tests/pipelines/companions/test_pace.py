@@ -11,13 +11,6 @@ from pipelines.companions.pace import CompletePace, Plan, RealtimePace, Recorded
 from pipelines.settings import CorrectionSettings, MappingSettings, OptimiseSettings
 
 
-def test_the_complete_pace_gives_what_the_settings_say() -> None:
-    pace = CompletePace(MappingSettings(optimise=OptimiseSettings(steps=7), corrections=CorrectionSettings(steps=3)))
-    assert pace.takes_keyframe()
-    assert pace.plan(level=2, keyframes=1, frames=1) == Plan(1.0, 7, swept=None)
-    assert pace.steps_after_correction(keyframes=1, frames=1) == 3
-
-
 @pytest.mark.parametrize(("every", "steps"), [(1, 4), (3, 12), (5, 20)])
 def test_the_keyframes_of_a_long_recording_share_its_budget_evenly(every: int, steps: int) -> None:
     """133 keyframes' 30 steps are 4,000 steps, for 1,000 frames and a keyframe every first, third or fifth."""
@@ -174,15 +167,6 @@ def test_a_camera_that_wants_too_many_keyframes_still_leaves_views_everywhere() 
     assert gaps.max() <= 2 * np.median(gaps) + 2
 
 
-def test_a_slow_camera_gets_all_the_work() -> None:
-    pace = RealtimePace(SETTINGS)
-    session = SimulatedMapper().run(camera(1.0, 120.0), pace)
-    late = [plan for plan in session.plans[5:] if plan is not None]
-    assert all(plan.pixels == 1.0 for plan in late)
-    assert pace.merged == pace.skipped == 0
-    assert session.idle > 0.5 * session.end, "the time left over goes into the map"
-
-
 def test_steps_give_way_before_depth_and_depth_before_whole_keyframes() -> None:
     """The slower the machine, the less of each; nothing gives way before what comes first has."""
     shares = []
@@ -205,40 +189,11 @@ def test_steps_give_way_before_depth_and_depth_before_whole_keyframes() -> None:
     assert keyframes[-1] < 0.8, "then whole keyframes"
 
 
-def test_keyframes_are_skipped_evenly() -> None:
-    pace = RealtimePace(SETTINGS)
-    session = SimulatedMapper(0.2, 0.4, 0.02, 0.004, every=2).run(camera(10, 60.0), pace)
-    assert pace.skipped > 20 and pace.merged == 0
-    gaps = np.diff(session.worked()[5:])
-    assert gaps.max() <= 4 * np.median(gaps)  # one gap of 8 with a median of 3 in eleven draws, the others below 8
-
-
 def test_the_decisions_are_those_that_the_mapper_was_given() -> None:
     pace = RealtimePace(SETTINGS)
     session = SimulatedMapper(hiccups={50: 3.0}).run(camera(10, 30.0), pace)
     assert pace.decisions == session.plans
     assert pace.merged == sum(plan is None for plan in session.plans)
-
-
-def test_no_measurement_of_a_clock_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same times give the same decisions, whatever the real clock says."""
-
-    def decisions() -> list[Plan | None]:
-        pace = RealtimePace(SETTINGS)
-        SimulatedMapper().run(camera(30, 10.0), pace)
-        return pace.decisions
-
-    first = decisions()
-    for name in ("time", "monotonic", "perf_counter"):
-        monkeypatch.setattr(f"time.{name}", lambda: pytest.fail("the pace read a clock"))
-    assert decisions() == first
-
-
-def test_a_repeated_setting_of_no_steps_is_kept() -> None:
-    pace = RealtimePace(MappingSettings(optimise=OptimiseSettings(steps=0)))
-    session = SimulatedMapper().run(camera(2, 20.0), pace)
-    assert all(plan is not None and plan.steps == 0 for plan in session.plans)
-    assert pace.skipped == 0
 
 
 @pytest.mark.parametrize(("step", "steps"), [(0.02, True), (1.0, False)])

@@ -93,12 +93,6 @@ def test_a_part_that_is_left_is_found_as_it_was_left(taichi_on_the_cpu: None) ->
         np.testing.assert_array_equal(array[place : place + len(was)], was[name])
 
 
-def test_two_walks_are_the_same_byte_for_byte(taichi_on_the_cpu: None) -> None:
-    one, other = (walk(mapper_of(), end=16).all_gaussians() for _ in range(2))
-    for name in one:
-        np.testing.assert_array_equal(one[name], other[name])
-
-
 def test_voxels_that_rest_change_nothing(taichi_on_the_cpu: None, monkeypatch: pytest.MonkeyPatch) -> None:
     mapper = walk(mapper_of())
     rests = mapper.densifier.voxels.marks()[2]
@@ -163,14 +157,6 @@ def test_a_limit_of_memory_moves_keyframes_to_disk(taichi_on_the_cpu: None) -> N
         np.testing.assert_array_equal(view.rgba, given.rgba)
         for name in ("xyz", "pixels", "ids"):
             np.testing.assert_array_equal(getattr(view.points, name), getattr(given.points, name))
-
-
-def test_keyframes_that_go_together_share_a_file(taichi_on_the_cpu: None, tmp_path: Path) -> None:
-    """A process may open 256 files at a time on macOS, 1,024 on Linux, and Python keeps those that are mapped open."""
-    mapper = walk(mapper_of(tmp_path / "blocks"), end=OUT)
-    moved = sum(view.pyramid[0].on_disk for view in mapper.keyframes)
-    files = len(list(tmp_path.glob("blocks/*/keyframes-*")))
-    assert 0 < files < moved
 
 
 def test_the_whole_map_is_what_lies_here_and_on_disk(

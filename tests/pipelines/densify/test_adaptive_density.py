@@ -151,14 +151,6 @@ def test_new_gaussians_have_no_history_and_the_others_keep_theirs(pool: Gaussian
     assert np.count_nonzero(steps == 9) == N - done.split
 
 
-def test_nothing_grows_where_gradients_are_small(pool: GaussianField) -> None:
-    density = filled(pool, np.full(N, 1.9e-4), prune_opacity=0.0)
-    before = pool.to_numpy()
-    assert density.adapt(EXTENT, prune_large=False) == (0, 0, 0)
-    for name, value in pool.to_numpy().items():
-        np.testing.assert_array_equal(value, before[name])
-
-
 def test_a_pool_that_fills_up_grows_where_gradients_are_largest(pool: GaussianField) -> None:
     gradients = np.random.default_rng(4).permutation(1000) * 1e-5 + 1e-3
     density = filled(pool, gradients, prune_opacity=0.0, clone_size=1e9)

@@ -85,15 +85,6 @@ def test_dissimilarity_is_one_minus_ssim_of_grey_images() -> None:
     np.testing.assert_allclose(dissimilarity(render, v.rgba)[inside], 1 - expected[inside], atol=2e-3)
 
 
-def test_a_masked_pixel_is_never_dissimilar() -> None:
-    mask = np.ones((120, 160), dtype=bool)
-    mask[30:90, 40:100] = False
-    v = view(mask=mask)
-    error = dissimilarity(np.full((120, 160, 3), 0.5, dtype=np.float32), v.rgba)
-    assert (error[~mask] == 0).all()
-    assert error[mask].mean() > 0.5
-
-
 def test_error_pixels_are_distinct_centres_of_high_error_without_a_tracked_point() -> None:
     v = view()
     error = np.zeros((120, 160), dtype=np.float32)
@@ -108,19 +99,6 @@ def test_error_pixels_are_distinct_centres_of_high_error_without_a_tracked_point
     assert not tracked & set(zip(column.tolist(), row.tolist(), strict=True))
 
 
-def test_no_more_pixels_are_drawn_than_there_are() -> None:
-    error = np.zeros((120, 160), dtype=np.float32)
-    error[5, 5:9] = 1.0
-    assert len(error_pixels(view(), error, DensifySettings(), RNG)) <= 4
-    assert len(error_pixels(view(), np.zeros_like(error), DensifySettings(), RNG)) == 0
-
-
-def test_the_warm_up_draws_from_the_whole_image() -> None:
-    pixels = error_pixels(view(), None, DensifySettings(), np.random.default_rng(3))
-    assert pixels.min(axis=0).max() < 5
-    assert (pixels.max(axis=0) > [155, 115]).all()
-
-
 def test_pixel_seeds_lie_on_their_rays_at_the_estimated_depth_where_it_is_known() -> None:
     pixels = np.array([[10.5, 20.5], [70.5, 100.5], [120.5, 60.5]])
     seeds = pixel_seeds(view(), [], pixels, Wall(), 0.06)
@@ -128,13 +106,6 @@ def test_pixel_seeds_lie_on_their_rays_at_the_estimated_depth_where_it_is_known(
     np.testing.assert_allclose(local[:, 2], 5.0)
     np.testing.assert_allclose(CAMERA.project(local), pixels[:2])
     np.testing.assert_allclose(seeds.size, 0.05)
-
-
-def test_every_pixel_may_have_a_limit_of_its_own() -> None:
-    pixels = np.array([[10.5, 20.5], [110.5, 100.5], [120.5, 60.5]])
-    seeds = pixel_seeds(view(), [], pixels, Wall(), np.array([0.001, 0.06, 2.0]))
-    local = seeds.xyz @ POSE[:3, :3].T + POSE[:3, 3]
-    np.testing.assert_allclose(CAMERA.project(local), pixels[2:])
 
 
 def sideways(view: Keyframe, baseline: float) -> Keyframe:
@@ -214,13 +185,6 @@ def test_a_misplacement_is_the_motion_of_the_pixel_in_the_views_that_see_it() ->
     np.testing.assert_allclose(misplacement(v, [v], pixels, depth, deviation), 0.0, atol=1e-9)
 
 
-def test_what_no_other_view_sees_is_misplaced_without_bound() -> None:
-    v = view()
-    pixels, depth, deviation = np.array([[2.5, 60.5]]), np.array([5.0]), np.array([0.2])
-    assert np.isinf(misplacement(v, [], pixels, depth, deviation)).all()
-    assert np.isinf(misplacement(v, [sideways(v, 1.0)], pixels, depth, deviation)).all()
-
-
 SMALL = PinholeCamera(20.0, 20.0, 8.0, 6.0, 16, 12)
 
 
@@ -242,20 +206,11 @@ def test_every_tracked_point_counts_once_as_the_last_view_that_shows_it_has_it()
     np.testing.assert_allclose(cloud.colour, [[0.6, 0.2, 0.8], [0.2, 0.2, 0.8], [0.2, 0.2, 0.8]])
 
 
-def test_no_view_has_no_points() -> None:
-    assert len(union_of_points([])) == 0
-
-
 def test_spacing_is_the_mean_distance_of_the_three_nearest() -> None:
     # Far from the origin, as worlds of trackers are.
     xyz = np.random.default_rng(3).normal(size=(700, 3)) * [1, 5, 0.1] + 300
     distances = np.sort(np.linalg.norm(xyz[:, None] - xyz[None], axis=2), axis=1)
     np.testing.assert_allclose(spacing(xyz), distances[:, 1:4].mean(axis=1), rtol=1e-4)
-
-
-def test_too_few_points_are_refused() -> None:
-    with pytest.raises(ValueError):
-        spacing(np.eye(3))
 
 
 def test_gaussians_begin_round_faint_and_as_wide_as_their_spacing() -> None:

@@ -1,3 +1,5 @@
+"""Adam against PyTorch, and the safeguards of steps of Gaussians and poses."""
+
 from __future__ import annotations
 
 import numpy as np
@@ -6,6 +8,8 @@ import torch
 
 from fields.map.gaussians import GaussianField
 from pipelines.optimise.adam import Adam, LearningRates
+from pipelines.optimise.poses import PoseRefinement
+from tests.pipelines.optimise.test_poses import POSE, black, tracked
 
 RATES = LearningRates(position=0.1, log_scale=0.2, quaternion=0.3, opacity_logit=0.4, colour=0.5)
 N = 40
@@ -76,24 +80,6 @@ def test_steps_are_those_of_pytorch_and_untouched_gaussians_stay(gaussians: Gaus
     assert (steps[~touched] == 0).all()
 
 
-def test_a_step_leaves_no_gradient_behind(gaussians: GaussianField) -> None:
-    state = load(gaussians)
-    set_gradients(gaussians, {name: np.ones(value.shape) for name, value in state.items()}, np.ones(N, dtype=bool))
-    Adam(gaussians).step(RATES)
-    for gradient in gaussians.gradients_to_numpy().values():
-        assert (gradient == 0).all()
-    assert (gaussians.touched.to_numpy() == 0).all()
-
-
-def test_a_gradient_that_is_not_finite_moves_nothing(gaussians: GaussianField) -> None:
-    state = load(gaussians)
-    gradients = {name: np.zeros(value.shape) for name, value in state.items()}
-    gradients["position"][3] = [np.nan, np.inf, -np.inf]
-    set_gradients(gaussians, gradients, np.ones(N, dtype=bool))
-    Adam(gaussians).step(RATES)
-    np.testing.assert_array_equal(gaussians.to_numpy()["position"], state["position"])
-
-
 def test_harmonics_above_the_active_degree_wait(gaussians: GaussianField) -> None:
     state = load(gaussians)
     ones = {name: np.ones(value.shape) for name, value in state.items()}
@@ -105,3 +91,58 @@ def test_harmonics_above_the_active_degree_wait(gaussians: GaussianField) -> Non
     assert (gaussians.sh_m.to_numpy()[:N, 1:] == 0).all()
     assert (gaussians.gradients_to_numpy()["sh"] == 0).all()
     np.testing.assert_allclose(result["sh"][:, 0], state["sh"][:, 0] - RATES.colour, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e25, -1e20])
+@pytest.mark.parametrize("name", ["position", "log_scale", "quaternion", "opacity_logit", "sh"])
+def test_a_gaussian_with_a_bad_gradient_keeps_all_that_it_is(gaussians: GaussianField, name: str, bad: float) -> None:
+    state = load(gaussians)
+    gradients = {key: np.ones(value.shape) for key, value in state.items()}
+    gradients[name].reshape(N, -1)[3, -1] = bad
+    set_gradients(gaussians, gradients, np.ones(N, dtype=bool))
+    Adam(gaussians).step(RATES)
+    after, history = gaussians.to_numpy(), gaussians.history()
+    others = np.arange(N) != 3
+    for key, value in state.items():
+        np.testing.assert_array_equal(after[key][3], value[3])
+        assert (after[key][others] != value[others]).all()
+        assert (history[f"{key}_m"][3] == 0).all() and (history[f"{key}_v"][3] == 0).all()
+        assert (gaussians.gradients_to_numpy()[key] == 0).all()
+    assert history["steps"].tolist() == others.astype(int).tolist()
+    assert gaussians.take_caught() == (1, 0)
+    assert gaussians.take_caught() == (0, 0)
+
+
+def test_an_exploding_gaussian_becomes_transparent_so_that_pruning_takes_it(gaussians: GaussianField) -> None:
+    state = load(gaussians)
+    state["log_scale"] = np.minimum(state["log_scale"], 1.0)
+    state["log_scale"][5] = [0.0, np.log(20.0) - 0.01, 1.0]
+    gaussians.load(state)
+    gradients = {key: np.zeros(value.shape) for key, value in state.items()}
+    gradients["log_scale"][5] = -1.0  # the step makes it larger, by the rate
+    set_gradients(gaussians, gradients, np.ones(N, dtype=bool))
+    Adam(gaussians).step(RATES, largest=20.0)
+    assert gaussians.take_caught() == (0, 1)
+    opacity = gaussians.opacities()
+    assert opacity[5] < 1e-8 and (np.delete(opacity, 5) > 1e-3).all()
+    assert gaussians.to_numpy()["log_scale"].max() <= np.float32(np.log(20.0))
+
+
+def test_a_camera_that_is_carried_away_stays_and_forgets_what_drove_it() -> None:
+    view, poses = black(), PoseRefinement()
+    T = view.T_camera_world.copy()
+    poses.step(view, np.array([1.0, 0, 0, 0, 0, 0]), 500.0)  # px: the image is 64 wide
+    np.testing.assert_array_equal(view.T_camera_world, T)
+    assert not poses.moments.steps
+    assert poses.safeguards.camera_steps == 1
+    poses.step(view, np.array([1.0, 0, 0, 0, 0, 0]), 0.1)
+    assert poses.safeguards.camera_steps == 1 and not np.array_equal(view.T_camera_world, T)
+
+
+def test_an_alignment_that_runs_away_leaves_the_tracked_pose() -> None:
+    """All points were tracked where none of them is: the least error lies far off."""
+    view, poses = tracked(POSE), PoseRefinement()
+    view.points.pixels[:] += [300.0, -250.0]
+    poses.align(view)
+    np.testing.assert_array_equal(view.T_camera_world, POSE)
+    assert poses.safeguards.camera_steps == 1

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 from types import SimpleNamespace
 
-import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -49,13 +48,6 @@ def test_the_colours_of_the_scene_are_those_that_develop_into_the_image() -> Non
     assert np.abs(found.reshape(scene.shape) - scene).max() < 0.5 / 255 / vignette().min() * 1.7
 
 
-def test_a_level_of_the_pyramid_finds_its_place_in_the_vignette() -> None:
-    view = keyframe(0.6 * vignette(), vignette())
-    view.rgba = cv2.resize(view.rgba, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    corner_and_middle = np.array([[0, 0], [CAMERA.width // 4, CAMERA.height // 4]])
-    np.testing.assert_allclose(scene_colours(view, corner_and_middle), 0.6, atol=0.005)
-
-
 def test_colours_stay_within_bounds_where_the_exposure_cannot_be_undone() -> None:
     image = np.ones((CAMERA.height, CAMERA.width, 3))
     singular = np.array([[1e-9, 0, 0, 0.5], [0, 1e-9, 0, 0.5], [0, 0, 0, 0.5]])
@@ -76,25 +68,12 @@ def test_the_fit_finds_gains_behind_outliers_and_saturated_pixels() -> None:
     np.testing.assert_allclose(fitted_gains(colours, image, np.ones(3)), gains, rtol=0.01)
 
 
-def test_a_channel_that_shows_nothing_keeps_its_gain() -> None:
-    colours = np.tile([0.5, 0.4, 0.001], (500, 1))
-    found = fitted_gains(colours, colours * [1.2, 3.0, 1.0], np.array([0.9, 0.9, 0.7]))
-    np.testing.assert_allclose(found, [1.2, 0.9, 0.7])  # green is saturated, blue is dark
-
-
 def test_without_news_from_the_image_the_exposure_returns_to_the_identity() -> None:
     refinement = ExposureRefinement(ExposureSettings(enabled=True, learning_rate=0.01))
     view = keyframe(np.zeros((CAMERA.height, CAMERA.width, 3)), exposure=EXPOSURE)
     for _ in range(200):
         refinement.step(view, np.zeros((3, 4)))
     np.testing.assert_allclose(view.exposure, IDENTITY, atol=0.01)
-
-
-def test_a_gradient_that_is_not_finite_moves_nothing() -> None:
-    refinement = ExposureRefinement(ExposureSettings(enabled=True))
-    view = keyframe(np.zeros((CAMERA.height, CAMERA.width, 3)), exposure=EXPOSURE)
-    refinement.step(view, np.full((3, 4), np.nan))
-    np.testing.assert_array_equal(view.exposure, EXPOSURE)
 
 
 def showing(share: float) -> SimpleNamespace:
@@ -285,18 +264,3 @@ def test_a_thing_that_hides_a_third_of_the_points_is_no_change() -> None:
     image = hidden.image.copy()
     image[:, : CAMERA.width // 3] = 0.9
     assert not light_changes(store_of([frame(0), replace(hidden, image=image)]))
-
-
-def test_a_vignette_is_no_change_where_it_is_known() -> None:
-    x = np.linspace(-1, 1, CAMERA.width)
-    light = np.repeat(np.repeat((0.75 + 0.25 * x)[None, :, None], CAMERA.height, axis=0), 3, axis=2).astype(np.float32)
-    known = [replace(f, image=f.image * light, vignette=light) for f in (frame(0), frame(6))]
-    assert not light_changes(store_of(known))
-
-
-def test_too_few_points_say_nothing() -> None:
-    def few(f: TrackedFrame) -> TrackedFrame:
-        p = f.points
-        return replace(f, points=replace(p, xyz=p.xyz[:10], pixels=p.pixels[:10], ids=p.ids[:10]))
-
-    assert not light_changes(store_of([few(frame(0)), few(brightened(1, 0.5))]))

@@ -94,17 +94,6 @@ def store() -> KeyframeStore:
     return store_of_views([POSE, exp_se3(MOTION) @ POSE, exp_se3(-np.array(MOTION)) @ POSE])
 
 
-def test_a_step_records_the_error_of_its_views_and_tells_their_mean_psnr(
-    optimiser: MapOptimiser, store: KeyframeStore
-) -> None:
-    expected = [optimiser.compare(store[j], store.scene_depth) for j in (0, 2)]
-    untouched = store[1].error
-    psnr = optimiser.step(store, [0, 2], optimiser.rates(store.scene_depth), pose_rate=0.0)
-    assert psnr == pytest.approx(np.mean([values.psnr for values in expected]))
-    assert [store[0].error, store[2].error] == [values.l1 for values in expected]
-    assert store[1].error == untouched
-
-
 def test_a_step_follows_the_mean_gradient_of_its_views(
     optimiser: MapOptimiser, store: KeyframeStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -122,16 +111,6 @@ def test_a_step_follows_the_mean_gradient_of_its_views(
         assert size > 0
         np.testing.assert_allclose(gradients[2][name], (first + gradients[1][name]) / 2, atol=1e-4 * size)
         np.testing.assert_allclose(gradients[3][name], (3 * first + gradients[1][name]) / 4, atol=1e-4 * size)
-
-
-def test_the_views_of_a_step_are_shared_out_among_batches(
-    optimiser: MapOptimiser, store: KeyframeStore, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    batches = []
-    monkeypatch.setattr(optimiser.adam, "step", lambda rates, size, **__: batches.append(size))
-    monkeypatch.setattr(optimiser, "settings", MappingSettings(optimise={"batch": 2}))
-    optimiser.step(store, [0, 1, 2, 0, 1], optimiser.rates(1.0), pose_rate=0.0)
-    assert batches == [2, 2, 1]
 
 
 def test_poses_move_only_where_asked_and_the_first_never(optimiser: MapOptimiser, store: KeyframeStore) -> None:
@@ -166,11 +145,3 @@ def test_steps_bring_the_render_to_the_image(optimiser: MapOptimiser, store: Key
     after = optimiser.compare(store[0], store.scene_depth)
     assert after.psnr > before.psnr + 1.5
     assert after.ssim > before.ssim + 0.1
-
-
-def test_positions_are_stepped_in_units_of_the_scene(optimiser: MapOptimiser) -> None:
-    o = SETTINGS.optimise
-    rates = optimiser.rates(scene_depth=50.0, position_factor=0.1, scale_factor=0.5)
-    assert rates.position == pytest.approx(o.position_rate * 50.0 * 0.1)
-    assert rates.log_scale == pytest.approx(o.scale_rate * 0.5)
-    assert (rates.quaternion, rates.opacity_logit, rates.colour) == (o.rotation_rate, o.opacity_rate, o.colour_rate)

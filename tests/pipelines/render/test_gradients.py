@@ -115,15 +115,3 @@ def test_the_vectorised_compositing_is_that_of_its_plain_twin(renderers: Callabl
     np.testing.assert_allclose(picture, twin_picture, rtol=0, atol=1e-5)
     for name, value in gradient.items():
         np.testing.assert_allclose(value, twin_gradient[name], rtol=0, atol=2e-4 * np.abs(value).max())
-
-
-def test_gaussians_out_of_view_get_no_gradient_and_no_mark(renderers: Callable[..., Renderer]) -> None:
-    functional = Functional(renderers(0, ti.f32))
-    state = random_gaussians(20, seed=9)
-    state["position"][::2] += 1000.0
-    gradients, _ = functional.gradients(state)
-    for value in gradients.values():
-        assert (value[::2] == 0).all()
-    marks = functional.renderer.gaussians.touched.to_numpy()[:20]
-    assert (marks[::2] == 0).all()
-    assert (marks[1::2] == 1).any()

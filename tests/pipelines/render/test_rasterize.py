@@ -75,15 +75,6 @@ def test_pictures_are_those_of_the_plain_renderer() -> None:
         np.testing.assert_allclose(output.detach(), truth, rtol=0, atol=2e-4)
 
 
-def test_no_gaussians_give_the_background() -> None:
-    nothing = tensors({name: value[:0] for name, value in random_gaussians(1, seed=1, degree=1).items()})
-    T = torch.from_numpy(POSE).requires_grad_()
-    picture = view(nothing, T, background=torch.tensor(BACKGROUND))
-    assert (picture.image == torch.tensor(BACKGROUND)).all()
-    gradients = gradients_of(picture, nothing | {"T_camera_world": T})
-    assert gradients["position"].shape == (0, 3) and (gradients["T_camera_world"] == 0).all()
-
-
 # ---- gradients ------------------------------------------------------------------------------------------------
 
 
@@ -110,16 +101,6 @@ def test_a_gradient_does_not_mind_pictures_drawn_in_between(scene: dict[str, Ten
     for name, value in expected.items():
         assert np.abs(value).max() > 0
         np.testing.assert_array_equal(found[name], value)
-
-
-@pytest.mark.slow
-def test_a_gradient_can_be_taken_again_and_by_parts(scene: dict[str, Tensor]) -> None:
-    picture = view(scene)
-    whole = torch.autograd.grad(picture.image.sum() + picture.depth.sum(), scene["position"], retain_graph=True)[0]
-    again = torch.autograd.grad(picture.image.sum() + picture.depth.sum(), scene["position"], retain_graph=True)[0]
-    parts = [torch.autograd.grad(part.sum(), scene["position"], retain_graph=True)[0] for part in picture[:2]]
-    np.testing.assert_array_equal(whole, again)
-    np.testing.assert_allclose(sum(parts), whole, atol=1e-5 * float(whole.abs().max()))
 
 
 # ---- what does not fit ----------------------------------------------------------------------------------------

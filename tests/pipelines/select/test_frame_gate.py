@@ -15,7 +15,7 @@ from pipelines.online import OnlineMapper
 from pipelines.settings import GateSettings
 from pipelines.state import save_state
 from tests.pipelines.test_online import SETTINGS
-from tests.pipelines.wall import frame, pose
+from tests.pipelines.wall import frame
 
 pytestmark = pytest.mark.slow
 
@@ -104,12 +104,3 @@ def test_refused_frames_leave_the_map_and_the_chance_alone(mapper: OnlineMapper)
                 assert array.tobytes() == after.arrays[name].tobytes(), name
     finally:
         mapper.gate.restore(gate)
-
-
-def test_switched_off_all_pass(mapper: OnlineMapper) -> None:
-    settings, mapper.gate.settings = mapper.gate.settings, GateSettings(enabled=False)
-    try:
-        assert refusal(mapper, replace(walk(12), T_camera_world=AWAY @ pose(0))) is None
-        assert refusal(mapper, replace(walk(12), image=np.zeros((48, 64, 3), np.float32))) is None
-    finally:
-        mapper.gate.settings = settings

@@ -129,14 +129,6 @@ def test_the_background_right_beside_an_object_is_found_on_all_its_sides() -> No
         assert (np.abs(found - 3.0) < 0.1)[beside & side].mean() > 0.9
 
 
-def test_where_pictures_say_nothing_the_map_stands() -> None:
-    seen, true = views(contrast=0.0)
-    depth = DepthMatcher(seen).matched(4)
-    assert error(depth, true[4]).max() < 0.01
-    alone = seen[:1]
-    np.testing.assert_array_equal(DepthMatcher(alone).matched(0), alone[0].depth)
-
-
 def test_neighbours_lie_on_both_sides_at_the_wanted_parallaxes() -> None:
     seen, _ = views(contrast=1.0)
     chosen = choose_neighbours(seen, 4)
@@ -169,7 +161,6 @@ def test_a_view_that_nobody_agrees_with_keeps_all_its_depth() -> None:
     assert (depth == wrong[4]).all()
 
 
-WIDE = PinholeCamera(100.0, 100.0, 80.0, 60.0, 160, 120)
 PLANE = np.array([0.002, -0.001, 0.5])  # inverse depth a x + b y + c
 
 
@@ -200,13 +191,6 @@ def test_the_inverse_depth_of_a_plane_is_linear() -> None:
     a, b = normal[:2] / 100.0 / offset
     np.testing.assert_allclose(plane, [a, b, normal[2] / offset - 80.0 * a - 60.0 * b], rtol=1e-2)
     assert on_it[90:].all() and on_it[:90].mean() < 0.2
-
-
-def test_points_of_no_plane_have_none() -> None:
-    rng = np.random.default_rng(2)
-    places = rng.uniform(0, 100, (200, 2))
-    assert fitted_plane(places, rng.uniform(0.2, 1.0, 200), rng) is None
-    assert fitted_plane(places[:2], np.ones(2), rng) is None
 
 
 def test_a_plain_region_gets_the_plane_around_it() -> None:

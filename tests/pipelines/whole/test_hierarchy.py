@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -14,7 +12,7 @@ from fields.map.gaussians import GaussianField
 from fields.runtime.backend import initialise
 from pipelines.companions.paging import grouped
 from pipelines.render.renderer import Renderer
-from pipelines.whole.hierarchy import LEVELS, MOST_OPAQUE, Hierarchy, ShownMap, merged
+from pipelines.whole.hierarchy import MOST_OPAQUE, Hierarchy, ShownMap, merged
 from tests.pipelines.wall import CAMERA
 
 
@@ -95,11 +93,6 @@ def test_gaussians_that_are_alone_or_large_stay_as_they_are() -> None:
         np.testing.assert_array_equal(some_of_them[name][kept][0], values[7])
 
 
-def test_no_gaussians_are_merged_to_none() -> None:
-    none, group = merged({name: values[:0] for name, values in some(3).items()}, np.zeros(0, dtype=np.int64), 1.0)
-    assert len(group) == 0 and none["sh"].shape == (0, 4, 3)
-
-
 FOCAL = 300.0
 
 
@@ -109,12 +102,6 @@ def street() -> Hierarchy:
     state = some(20_000)
     state["position"][:, 2] = 20.0 * state["position"][:, 2] + 40.0
     return Hierarchy(state)
-
-
-def test_a_level_has_fewer_gaussians_than_the_one_above(street: Hierarchy) -> None:
-    counts = [len(street.level(number)) for number in range(LEVELS + 1)]
-    assert counts[0] == 20_000 and all(below < 0.8 * above for above, below in pairwise(counts))
-    assert np.array_equal(np.sort(street.level(0).places), np.arange(20_000))
 
 
 def test_a_map_that_fits_is_drawn_as_it_is(street: Hierarchy) -> None:
@@ -139,19 +126,6 @@ def test_far_blocks_lose_detail_first_until_all_fit(street: Hierarchy, most: int
         there = street.gaussians(np.array([block]), np.array([level]))["position"]
         box = street.blocks.boxes[np.array([block])]
         assert len(there) and (there >= box.low - 1e-5).all() and (there <= box.high + 1e-5).all()
-
-
-def test_of_more_blocks_than_fit_the_nearest_are_drawn(street: Hierarchy) -> None:
-    blocks = np.arange(len(street.blocks))
-    levels = street.levels_for(blocks, np.zeros(3), FOCAL, 100)
-    distance = street.blocks.boxes.distance(np.zeros(3))
-    assert (levels < 0).any() and (levels >= 0).any()
-    assert distance[levels >= 0].max() <= distance[levels < 0].min()
-
-
-def test_nothing_is_drawn_of_no_blocks(street: Hierarchy) -> None:
-    none = np.zeros(0, dtype=np.int64)
-    assert len(street.gaussians(none, street.levels_for(none, np.zeros(3), FOCAL, 10))["position"]) == 0
 
 
 def test_a_group_ends_before_it_would_see_more_than_fits() -> None:
@@ -179,19 +153,6 @@ def test_a_group_ends_before_another_place_that_does_not_fit_whole() -> None:
     assert grouped(seen, counts, 70).tolist() == [0, 0, 0, 0, 0, 0, 1]
     counts[3] = 1  # now hardly any
     assert grouped(seen, counts, 65).tolist() == [0, 0, 0, 1, 1, 1, 1]
-
-
-def test_everything_that_fits_is_one_group() -> None:
-    assert grouped(np.ones((4, 2), dtype=bool), np.array([3, 4]), 7).tolist() == [0, 0, 0, 0]
-
-
-def test_a_keyframe_that_sees_more_than_fits_is_alone() -> None:
-    seen = np.array([[1, 0], [1, 1], [0, 1]], dtype=bool)
-    assert grouped(seen, np.array([5, 6]), 7).tolist() == [0, 1, 2]
-
-
-def test_no_keyframes_are_no_groups() -> None:
-    assert grouped(np.zeros((0, 2), dtype=bool), np.array([3, 4]), 7).tolist() == []
 
 
 @pytest.fixture(scope="module")

@@ -102,14 +102,6 @@ def test_fog_before_a_wall_floats_unless_the_map_that_shows_the_wall_has_it(
     assert floating[400] == (of_fog == 1)
 
 
-def test_what_another_map_does_not_see_does_not_float(renderers: Callable[..., Renderer]) -> None:
-    renderer, state = renderers(), wall_and_fog()
-    renderer.gaussians.load(state)
-    nothing = ShownSurface(0, CAMERA, POSE, np.zeros(SIZE))
-    away = ShownSurface(0, CAMERA, exp_se3([0.0, 0.0, 0.0, 0.0, np.pi, 0.0]) @ POSE, np.full(SIZE, 4.0))
-    assert not FreeSpace(renderer, NEAR).floating(np.ones(401, dtype=int), [nothing, away]).any()
-
-
 def transform(rng: np.random.Generator) -> NDArray[np.float64]:
     return np.column_stack([np.eye(3) + 0.1 * rng.normal(size=(3, 3)), 0.05 * rng.normal(size=3)])
 
@@ -144,14 +136,6 @@ def test_the_changes_are_found_along_a_chain_of_shared_frames() -> None:
     colours = rng.random((4, 3))
     for change, into in zip(of_map, colour_changes(exposures), strict=True):
         np.testing.assert_allclose(applied(into, applied(change, colours)), colours, atol=1e-9)
-
-
-def test_maps_without_shared_frames_keep_the_gauge_before_them() -> None:
-    rng = np.random.default_rng(4)
-    shared = transform(rng)
-    changes = colour_changes([{0: np.eye(3, 4)}, {0: shared, 1: shared}, {2: transform(rng)}])
-    np.testing.assert_array_equal(changes[2], changes[1])
-    np.testing.assert_allclose(changes[1], shared, atol=1e-12)
 
 
 EDGE = 0.5
@@ -207,14 +191,6 @@ def test_a_place_that_only_one_map_shows_stays_whole() -> None:
     far = Shown(second.position + np.array([100.0, 0.0, 0.0]), second.coverage)
     for kept, each in zip(owned([first, far], EDGE), (first, far), strict=True):
         np.testing.assert_array_equal(kept, each.coverage > 0)
-
-
-def test_no_cube_keeps_gaussians_of_two_maps() -> None:
-    given = maps(6, count=4, spread=0.8)
-    kept = owned(given, EDGE)
-    cubes = [set(map(tuple, np.floor(m.position[k] / EDGE).astype(int))) for m, k in zip(given, kept, strict=True)]
-    assert sum(map(len, cubes)) == len(set().union(*cubes))
-    assert all(kept_here.any() for kept_here in kept)
 
 
 def test_what_lies_at_infinity_is_taken_as_one_cube() -> None:

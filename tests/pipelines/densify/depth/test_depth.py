@@ -17,7 +17,6 @@ from pipelines.densify.depth.gaussian_process import (
     conditioning_points,
     matern32,
     nonstationary_matern32,
-    nonstationary_variance,
     regress_log_depth,
 )
 from pipelines.densify.depth.sources import MapDepth
@@ -52,11 +51,6 @@ def test_varying_covariances_stay_a_process() -> None:
     torch.testing.assert_close(K, K.T)
     assert torch.linalg.eigvalsh(K).min() > -1e-7
     assert (torch.diagonal(K) > 0.999).all()
-
-
-def test_the_variance_is_the_diagonal() -> None:
-    p, E = places(20, 6), torch.cat([covariances(10, 7), 1e-3 * covariances(10, 8)])
-    torch.testing.assert_close(nonstationary_variance(E), torch.diagonal(nonstationary_matern32(p, E, p, E)))
 
 
 CAMERA = PinholeCamera(100.0, 100.0, 80.0, 60.0, 160, 120)
@@ -105,27 +99,6 @@ def test_points_are_met_and_far_from_them_nothing_is_known(grid: np.ndarray) -> 
     assert away.deviation[0] > 0.9 * np.log(depth).std()
 
 
-def test_the_process_is_the_closed_form(grid: np.ndarray) -> None:
-    few = grid[::7]
-    process = estimator()
-    process.LENGTHS, process.NOISE_RATIOS = (0.3,), (1e-2,)  # nothing to choose
-    asked = np.array([[33.0, 44.0], [99.0, 12.0]])
-    estimate = process.estimate(view(few, surface(few)), [], asked)
-
-    def kernel(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        r = np.sqrt(3) * np.linalg.norm(a[:, None] - b[None], axis=2) / 160 / 0.3
-        return (1 + r) * np.exp(-r)
-
-    y = np.log(surface(few))
-    K = kernel(few, few) + 1e-2 * np.eye(len(few))
-    k = kernel(asked, few)
-    mean = y.mean() + k @ np.linalg.solve(K, y - y.mean())
-    variance = (y - y.mean()) @ np.linalg.solve(K, y - y.mean()) / len(y)
-    deviation = np.sqrt(variance * (1 - np.einsum("ij,ji->i", k, np.linalg.solve(K, k.T))))
-    np.testing.assert_allclose(estimate.depth, np.exp(mean), rtol=1e-9)
-    np.testing.assert_allclose(estimate.deviation, deviation, rtol=1e-6)
-
-
 def test_scale_changes_the_depth_and_not_its_deviation(grid: np.ndarray) -> None:
     asked = np.array([[33.0, 44.0], [99.0, 12.0]])
     one = estimator().estimate(view(grid, surface(grid)), [], asked)
@@ -140,18 +113,6 @@ def test_points_behind_the_camera_or_outside_the_image_have_no_say(grid: np.ndar
     wrong = np.array([[40.0, 40.0], [-30.0, 50.0]])
     mixed = view(np.concatenate([grid, wrong]), np.concatenate([surface(grid), [-3.0, 9.0]]))
     np.testing.assert_array_equal(estimator().estimate(mixed, [], asked).depth, clean.depth)
-
-
-def test_no_more_points_than_allowed_condition_it(grid: np.ndarray) -> None:
-    # Over twelve draws, the deviation is below the bound at 85 to 126 of the 165 points.
-    estimate = estimator(max_points=12).estimate(view(grid, surface(grid)), [], grid)
-    assert np.count_nonzero(estimate.deviation < 0.02) < len(grid)
-    assert np.median(np.abs(np.log(estimate.depth / surface(grid)))) < 0.05
-
-
-def test_without_points_nothing_is_known() -> None:
-    estimate = estimator().estimate(view(np.zeros((0, 2)), np.zeros(0)), [], np.array([[3.0, 3.0]]))
-    assert np.isinf(estimate.deviation).all()
 
 
 def two_walls(rng: np.random.Generator) -> tuple[Keyframe, np.ndarray, np.ndarray]:
@@ -176,13 +137,6 @@ def test_depth_jumps_where_the_colour_does() -> None:
     errors = [np.abs(np.log(e.depth / truth)) for e in (guided, constant)]
     assert np.mean(errors[0] > 0.1) < 0.5 * np.mean(errors[1] > 0.1)
     assert errors[0].mean() < 0.5 * errors[1].mean()
-
-
-def test_without_colour_the_guided_process_is_the_constant_one(grid: np.ndarray) -> None:
-    asked = np.random.default_rng(1).uniform([5, 5], [155, 115], (50, 2))
-    v = view(grid, surface(grid))  # black all over
-    guided = ImageGuidedDepth(DepthSettings(), np.random.default_rng(0)).estimate(v, [], asked)
-    np.testing.assert_allclose(guided.depth, estimator().estimate(v, [], asked).depth, rtol=1e-9)
 
 
 class Says:
@@ -262,13 +216,6 @@ def test_the_conditional_is_that_of_the_joint_gaussian() -> None:
     np.testing.assert_allclose(estimate.deviation, np.sqrt(np.diag(covariance)), rtol=1e-10)
 
 
-def test_a_place_that_is_known_exactly_has_no_deviation() -> None:
-    K = torch.eye(3, dtype=torch.float64)
-    estimate = regress_log_depth(np.array([1.0, 2.0, 4.0]), K, 0.0, K, 1.0)
-    np.testing.assert_allclose(estimate.depth, [1.0, 2.0, 4.0])
-    assert estimate.deviation == pytest.approx(0.0, abs=1e-7)
-
-
 VIEW = 2
 
 
@@ -320,8 +267,3 @@ def test_the_deviation_is_how_far_the_map_is_from_the_tracked_points(wall: Rende
     found = estimate(wall, np.array([[20.5, 20.5], [30.5, 30.5]]))
     assert (found.deviation > np.log(1.1)).all()
     assert (found.deviation < 2 * MapDepth.CAUTION * np.log(1.1)).all()
-
-
-def test_an_empty_map_knows_nothing(renderer: Renderer) -> None:
-    renderer.gaussians.remove(np.zeros(len(renderer.gaussians), dtype=bool))
-    assert np.isinf(estimate(renderer, np.array([[20.5, 20.5]])).deviation).all()

@@ -26,16 +26,6 @@ def frame(index: int, depths: tuple[float, ...] = (2.0, 4.0, 6.0), T: np.ndarray
     return TrackedFrame(index, index / 30, f"{index}", np.zeros((6, 8, 3), np.float32), CAMERA, T, points)
 
 
-def test_a_view_has_the_scale_of_a_pixel_at_its_median_depth() -> None:
-    keyframe = KeyframeStore().append(frame(0, T=exp_se3([1, 2, 3, 0.1, 0.2, 0.3])))
-    assert keyframe.median_depth == pytest.approx(4.0)
-    assert keyframe.view_scale == pytest.approx(4.0 / 20.0)
-
-
-def test_points_behind_the_camera_have_no_say() -> None:
-    assert KeyframeStore().append(frame(0, (-5.0, 3.0, -7.0))).median_depth == pytest.approx(3.0)
-
-
 def test_the_scene_depth_is_the_median_over_keyframes() -> None:
     store = KeyframeStore()
     for index, depth in enumerate((1.0, 9.0, 2.0)):
@@ -78,19 +68,6 @@ def test_the_views_of_a_rig_share_corrections_with_their_own_keyframes_only() ->
     assert store.before(8, 1) == []
 
 
-def test_a_new_keyframe_begins_with_the_correction_of_the_last() -> None:
-    store = KeyframeStore()
-    first = store.append(frame(0))
-    first.T_camera_world = exp_se3([0.1, 0, 0, 0, 0, 0.2]) @ first.T_tracked
-    second = store.append(frame(1))
-    np.testing.assert_allclose(second.correction, first.correction, atol=1e-12)
-
-
-def test_without_keyframes_the_tracked_pose_stands() -> None:
-    T = exp_se3([1, 2, 3, 0.1, 0.2, 0.3])
-    np.testing.assert_array_equal(KeyframeStore().corrected(5, T), T)
-
-
 def test_exposure_is_interpolated_between_keyframes_and_the_nearest_outside() -> None:
     store = KeyframeStore()
     assert store.exposure_at(0) is None
@@ -115,22 +92,6 @@ def test_nothing_is_interpolated_between_two_places() -> None:
     for index, value, share in ((10, 1.0, 1.0), (14, 1.0, 1.0), (16, 3.0, 4.0), (20, 3.0, 4.0), (21, 4.0, 4.0)):
         np.testing.assert_allclose(store.exposure_at(index), value)
         np.testing.assert_allclose(store.corrected(index, np.eye(4)), exp_se3(share * twist), atol=1e-12)
-
-
-def test_a_new_keyframe_starts_with_the_exposure_of_the_last_but_shares_no_memory_with_it() -> None:
-    store = KeyframeStore()
-    store.append(frame(0)).exposure = np.full((3, 4), 2.0)
-    new = store.append(frame(1))
-    np.testing.assert_array_equal(new.exposure, np.full((3, 4), 2.0))
-    new.exposure += 1.0
-    np.testing.assert_array_equal(store[0].exposure, np.full((3, 4), 2.0))
-
-
-def test_exposure_that_is_not_estimated_is_none() -> None:
-    store = KeyframeStore()
-    store.append(frame(0))
-    assert store.append(frame(1)).exposure is None
-    assert store.exposure_at(5) is None
 
 
 def test_a_revised_keyframe_keeps_its_refinement_and_sees_the_same() -> None:
@@ -266,8 +227,3 @@ def test_it_is_the_median_of_what_came_so_far() -> None:
         median.add(value)
         assert len(median) == n
         assert median.value == np.median(values[:n])
-
-
-def test_nothing_has_no_median() -> None:
-    with pytest.raises(IndexError):
-        _ = RunningMedian().value

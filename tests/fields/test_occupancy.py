@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -62,22 +60,6 @@ class PlainVoxels:
             return False
         self.mark(p, size)
         return True
-
-
-def test_batches_are_answered_as_by_plain_sets(voxels: Callable[..., OccupancyVoxels]) -> None:
-    ours, plain = voxels(1.0, levels=6, resolution=64), PlainVoxels(1.0, 6)
-    rng = np.random.default_rng(0)
-    admitted = []
-    for size in (0.3, 0.05, 0.12, 2.0, 0.03):
-        points = rng.uniform(-3, 3, (700, 3)) * [1, 1, 0.2]
-        expected = [plain.occupied(p, size) for p in points]
-        assert ours.query(points, size).tolist() == expected
-        # One after the other, the first of a cell wins: that is what a batch promises, on every run.
-        expected = [plain.admit(p, size) for p in points]
-        assert ours.admit(points, size).tolist() == expected
-        admitted.append(np.mean(expected))
-    assert min(admitted) < 0.1
-    assert max(admitted) > 0.9
 
 
 def test_batches_of_mixed_sizes_are_answered_as_by_plain_sets(voxels: Callable[..., OccupancyVoxels]) -> None:
@@ -241,42 +223,6 @@ def test_places_that_rest_answer_as_before_and_take_less(voxels: Callable[..., O
     assert ours._bricks.count < 300  # of one region
     ours.rest(np.zeros((0, 3)))
     assert ours._bricks.count == 0
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-def test_memory_of_places_that_rest_is_used_again(taichi_on_the_cpu: None) -> None:
-    resource = pytest.importorskip("resource")
-    initialise("cpu")
-    voxels, rng, held = OccupancyVoxels(1.0, levels=8, resolution=512), np.random.default_rng(6), []
-    for place in range(8):
-        voxels.update(rng.uniform(-16, 16, (60_000, 3)) * [1, 1, 0] + [0, 0, 64.0 * place], 0.01)
-        voxels.rest(np.zeros((0, 3)))
-        held.append(int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1]) * resource.getpagesize())
-    # Five further places take 63 MB in use. The first ones also compile the kernels.
-    assert held[-1] - held[2] < 30e6
-
-
-@pytest.mark.parametrize("wrong", [{"levels": 0}, {"levels": 12, "resolution": 512}, {"coarsest": 0.0}])
-def test_impossible_voxels_are_refused(wrong: dict[str, float]) -> None:
-    with pytest.raises(ValueError):
-        OccupancyVoxels(**({"coarsest": 1.0} | wrong))
-
-
-@pytest.mark.parametrize(
-    ("points", "size", "complaint"),
-    [
-        (np.zeros((3, 4)), 0.1, r"positions have shape \(3, 4\), expected \(N, 3\)"),
-        (np.zeros(3), 0.1, r"positions have shape \(3,\), expected \(N, 3\)"),
-        (np.zeros((4, 3)), np.ones(3), r"target sizes have shape \(3,\), expected one number or \(4,\)"),
-    ],
-)
-def test_points_of_another_shape_are_refused(
-    voxels: Callable[..., OccupancyVoxels], points: NDArray, size: float | NDArray, complaint: str
-) -> None:
-    ours = voxels()
-    for ask in (ours.query, ours.admit, ours.update):
-        with pytest.raises(ValueError, match=complaint):
-            ask(points, size)
 
 
 def test_marking_adds_at_most_the_bytes_foretold_and_just_those_in_empty_voxels(

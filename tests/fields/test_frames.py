@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fields.frames.pose_correction import PoseCorrection
-from fields.frames.tracked_frame import MIN_SIDE, SparsePoints, TrackedFrame, build_pyramid
+from fields.frames.tracked_frame import SparsePoints, TrackedFrame, build_pyramid
 from fields.geometry.camera import PinholeCamera
 from fields.map.keyframes import KeyframeStore
 
@@ -40,13 +40,6 @@ def frame(**changes: object) -> TrackedFrame:
 def test_frames_that_do_not_fit_together_are_refused(changes: dict[str, object], complaint: str) -> None:
     with pytest.raises(ValueError, match=complaint):
         frame(**changes)
-
-
-def test_points_that_do_not_fit_together_are_refused() -> None:
-    with pytest.raises(ValueError):
-        SparsePoints(np.zeros((2, 3)), np.zeros((3, 2)), np.zeros(2, dtype=np.int64))
-    with pytest.raises(ValueError):
-        SparsePoints(np.full((1, 3), np.nan), np.zeros((1, 2)), np.zeros(1, dtype=np.int64))
 
 
 def test_eight_bits_hold_the_image_and_its_mask() -> None:
@@ -88,13 +81,6 @@ def test_arrays_become_a_frame() -> None:
     np.testing.assert_allclose(made.points.depths(made.T_camera_world), [2.0, 4.0])
 
 
-def test_points_without_numbers_are_all_different() -> None:
-    frames = [TrackedFrame.from_arrays(**{**ARRAYS, "index": i}) for i in (0, 1, 500)]
-    ids = np.concatenate([made.points.ids for made in frames])
-    assert len(set(ids.tolist())) == 6 and (ids >= 0).all()
-    assert [made.timestamp for made in frames] == [0.0, 1.0, 500.0]
-
-
 @pytest.mark.parametrize(
     ("changes", "error", "complaint"),
     [
@@ -134,12 +120,6 @@ def test_a_frame_may_have_no_points() -> None:
         TrackedFrame.from_arrays(0, IMAGE, np.eye(4), (10.0, 10.0, 4.0, 3.0), [], [[1.0, 1.0]])
 
 
-def test_an_id_that_stands_twice_is_named() -> None:
-    xyz, pixels = [[0.0, 0.0, 2.0]] * 3, [[1.0, 1.0]] * 3
-    with pytest.raises(ValueError, match=r"^frame 3: id 7 [^\n]*$"):
-        TrackedFrame.from_arrays(3, IMAGE, np.eye(4), (10.0, 10.0, 4.0, 3.0), xyz, pixels, [7, 2, 7])
-
-
 LARGE = PinholeCamera(800.0, 760.0, 520.0, 240.0, 1024, 512)
 
 
@@ -158,13 +138,6 @@ def test_a_pixel_is_the_mean_of_those_that_it_covers() -> None:
     assert levels[0].rgba is rgba
 
 
-def test_a_point_is_seen_at_the_same_place_of_every_level() -> None:
-    point = np.array([[0.3, -0.2, 2.0]])
-    full, half, quarter = (level.camera.project(point) for level in build_pyramid(image(), LARGE, 3))
-    np.testing.assert_allclose(half, full / 2)
-    np.testing.assert_allclose(quarter, full / 4)
-
-
 def test_a_pixel_is_valid_where_all_that_it_covers_are() -> None:
     rgba = image()
     rgba[10, 21] = 0
@@ -179,12 +152,6 @@ def test_odd_sides_keep_the_field_of_view() -> None:
     assert (half.width, half.height) == (150, 130)
     assert half.width / half.fx == pytest.approx(301 / 400.0)
     assert half.height / half.fy == pytest.approx(261 / 400.0)
-
-
-def test_no_level_is_too_small_for_the_loss() -> None:
-    levels = build_pyramid(image(), LARGE, 8)
-    assert min(levels[-1].camera.width, levels[-1].camera.height) >= MIN_SIDE
-    assert min(levels[-1].camera.width, levels[-1].camera.height) < 2 * MIN_SIDE
 
 
 def test_a_keyframe_at_a_level_is_the_same_view_of_fewer_pixels() -> None:
