@@ -196,7 +196,6 @@ def test_sums_over_the_first_axis_are_exact() -> None:
 pytestmark = pytest.mark.slow
 
 
-
 def has_cuda_driver() -> bool:
     try:
         ctypes.CDLL("libcuda.so.1")
