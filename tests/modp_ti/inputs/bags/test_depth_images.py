@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 import pytest
 
-from modp_ti.files.errors import InputError
 from modp_ti.inputs.bags.messages import depth_metres
 from tests.bags import START, STEP, Messages, recording, write_bag
 
@@ -96,11 +95,3 @@ def test_depths_of_a_sensor_beside_the_camera_are_moved_to_it(views, tmp_path, o
         messages.append(("/depth/image", time, MAKE.image(time, values, "16UC1", "depth_optical")))
         messages.append(("/depth/camera_info", time, MAKE.info(time, K_SENSOR, size, frame="depth_optical")))
     assert_on_the_plane(opened(write_bag(tmp_path / "room", "mcap", messages), {"scale": 1}), len(views))
-
-
-def test_depths_of_other_times_are_not_used_unless_they_are_asked_for(views, tmp_path, opened):
-    path = write_bag(tmp_path / "room", "mcap", with_depths(views, delay=20 * STEP))
-    tracker = opened(path, {"scale": 1})
-    assert "within 0.05 s of it: depth images are not used" in " ".join(tracker.notes)
-    with pytest.raises(InputError, match=r"no image sees a depth of /depth/image"):
-        opened(path, {"scale": 1}, depth="/depth/image")

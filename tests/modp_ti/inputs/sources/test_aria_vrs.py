@@ -88,13 +88,3 @@ def test_vignetting_mask_is_undistorted_with_the_images(recording, mask):
     assert made.vignette[5, 5].max() < 0.6 < made.vignette[400, 400].min()
     picture = FrameReader(made, settings).read(made.names[0], made.intrinsics.undistorter(0.5))
     assert picture.image.shape == picture.vignette.shape == (400, 400, 3)
-
-
-@needs_library
-def test_parts_that_the_fisheye_does_not_see_are_masked(recording):
-    settings = SourceSettings(path=recording, vrs=VrsSettings(focal=150.0))
-    made = open_source(settings)
-    picture = FrameReader(made, settings).read(made.names[0], made.intrinsics.undistorter(1.0))
-    assert picture.mask[400, 400] and not picture.mask[10, 10]
-    assert made.read(made.names[0])[~picture.mask].max() == 0
-    assert "give its vignetting mask as source.vignette" in made.notes[1]
