@@ -61,44 +61,32 @@ def parse_ply_header(data: bytes, path: Path) -> PlyHeader:
     newline = data.find(b"\n", found, found + 16)
     if not data.startswith(b"ply") or found < 0 or newline < 0:
         raise InputError(f"{path}: not a PLY file")
-    header = _parsed(data[:found].decode("ascii", "replace").splitlines()[1:], newline + 1, path)
-    room = len(data) - header.start
-    if header.form == "ascii":
-        least = 2 * len(header.properties)  # one digit and one separator
-        room += 1  # the last separator may be missing
-    elif header.form in ("binary_little_endian", "binary_big_endian"):
-        least = sum(int(kind[1:]) for _, kind in header.properties)
-    else:
-        raise InputError(f"{path}: PLY of format {header.form[:40]!r} cannot be read")
-    if header.count * least > room:
-        raise InputError(
-            f"{path}: the PLY file is damaged or cut off: {header.count} vertices are announced and fewer are there"
-        )
-    return header
-
-
-def _parsed(lines: list[str], start: int, path: Path) -> PlyHeader:
-    form, count, element = "", 0, ""
-    elements: list[str] = []
-    properties: list[tuple[str, str]] = []
-    for words in map(str.split, lines):
-        if not words or words[0] in ("comment", "obj_info"):
-            continue
-        if words[0] == "format" and len(words) >= 2:
-            form = words[1]
-        elif words[0] == "element":
-            if len(words) != 3 or not words[2].isdecimal() or len(words[2]) > MAX_DIGITS:
+    form, count, elements, properties = "", 0, [], []
+    for words in map(str.split, data[:found].decode("ascii", "replace").splitlines()[1:]):
+        match words:
+            case ["format", form, *_]:
+                pass
+            case ["element", element, number] if number.isdecimal() and len(number) <= MAX_DIGITS:
+                elements.append(element)
+                count = int(number) if element == "vertex" else count
+            case ["element", *_]:
                 raise InputError(f"{path}: the PLY file is damaged: {' '.join(words)[:60]!r} in its header")
-            element = words[1]
-            elements.append(element)
-            count = int(words[2]) if element == "vertex" else count
-        elif words[0] == "property" and element == "vertex":
-            if len(words) != 3 or words[1] not in PLY_TYPES:
+            case ["property", kind, name] if elements[-1:] == ["vertex"] and kind in PLY_TYPES:
+                properties.append((name, PLY_TYPES[kind]))
+            case ["property", *_] if elements[-1:] == ["vertex"]:
                 raise InputError(f"{path}: vertices with `{' '.join(words)[:60]}` cannot be read")
-            properties.append((words[2], PLY_TYPES[words[1]]))
-    names = {name for name, _ in properties}
-    if not elements or elements[0] != "vertex" or elements.count("vertex") > 1:
+    if elements[:1] != ["vertex"] or elements.count("vertex") > 1:
         raise InputError(f"{path}: the first element of the PLY file must be `vertex`, and the others not")
-    if len(names) != len(properties) or len(properties) > MAX_PROPERTIES:
+    if len(dict(properties)) != len(properties) or len(properties) > MAX_PROPERTIES:
         raise InputError(f"{path}: the PLY file is damaged: its vertices have one property twice, or too many")
-    return PlyHeader(form, count, properties, start)
+    room = len(data) - newline - 1
+    if form == "ascii":
+        least = 2 * len(properties)  # one digit and one separator
+        room += 1  # the last separator may be missing
+    elif form in ("binary_little_endian", "binary_big_endian"):
+        least = sum(int(kind[1:]) for _, kind in properties)
+    else:
+        raise InputError(f"{path}: PLY of format {form[:40]!r} cannot be read")
+    if count * least > room:
+        raise InputError(f"{path}: the PLY file is damaged or cut off: {count} vertices are announced, fewer are there")
+    return PlyHeader(form, count, properties, newline + 1)

@@ -64,27 +64,19 @@ def read_ply_points(path: Path) -> NDArray[np.float64]:
     header = parse_ply_header(data, path)
     if not set("xyz") <= set(header.names):
         raise InputError(f"{path}: the vertices have no x, y and z")
-    places = [header.names.index(axis) for axis in "xyz"]
-    xyz = np.empty((header.count, 3))
-    try:
+    with reading(path), np.errstate(all="ignore"):  # converting a signalling NaN to float64 warns
         if header.form == "ascii":
-            file = io.BytesIO(data)
-            file.seek(header.start)
-            lines = limited_lines(io.TextIOWrapper(file, encoding="ascii"))
-            rows = islice((line.split() for line in lines if not line.isspace()), header.count)
-            for row, words in zip(xyz, rows, strict=True):
-                if len(words) < len(header.properties):
-                    raise ValueError
-                row[:] = [float(words[place]) for place in places]
+            text = io.TextIOWrapper(io.BytesIO(data[header.start :]), encoding="ascii")
+            rows = list(islice((line for line in limited_lines(text) if not line.isspace()), header.count))
+            if len(rows) < header.count or any(len(row.split()) < len(header.properties) for row in rows[-1:]):
+                raise InputError(f"{path}: the PLY file is damaged or cut off")
+            places = [header.names.index(axis) for axis in "xyz"]
+            xyz = np.loadtxt(rows, usecols=places, ndmin=2) if rows else np.zeros((0, 3))
         else:
-            order = {"binary_little_endian": "<", "binary_big_endian": ">"}[header.form]
+            order = "<" if header.form == "binary_little_endian" else ">"
             record = np.dtype([(name, order + kind) for name, kind in header.properties])
             vertices = np.frombuffer(data, dtype=record, count=header.count, offset=header.start)
-            with np.errstate(all="ignore"):  # converting a signalling NaN to float64 warns
-                for column, axis in enumerate("xyz"):
-                    xyz[:, column] = vertices[axis]
-    except (ValueError, OSError):  # OSError: a line is too long
-        raise InputError(f"{path}: the PLY file is damaged or cut off") from None
+            xyz = np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1)
     return xyz[(np.abs(xyz) <= FARTHEST).all(axis=1)]
 
 
@@ -111,7 +103,7 @@ def _read_pcd(path: Path) -> NDArray[np.float64]:
     header = {words[0]: words[1:] for words in lines if words}
     if form.strip() == b"binary_compressed":
         raise InputError(f"{path}: a compressed PCD file: save it as binary or ASCII (pcl_convert_pcd_ascii_binary)")
-    try:
+    with reading(path, " (tracker.points)"):
         names, count = header["FIELDS"], int(header["POINTS"][0])
         repeats = [int(n) for n in header.get("COUNT", ["1"] * len(names))]
         if form.strip() == b"ascii":
@@ -123,8 +115,6 @@ def _read_pcd(path: Path) -> NDArray[np.float64]:
         record = np.dtype([(f"{name} {n}", kind, (many,)) for n, (name, kind, many) in enumerate(fields)])
         table = np.frombuffer(content, record, count)
         return np.stack([table[f"{axis} {names.index(axis)}"][:, 0] for axis in "xyz"], axis=1).astype(np.float64)
-    except (KeyError, ValueError, IndexError, TypeError):
-        raise InputError(f"{path}: the PCD file is damaged or cut off") from None
 
 
 def projected_points(

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.geometry.camera import PinholeCamera
+from modp_ti.files import open_file, reading
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.sources.intrinsics import Intrinsics
 from modp_ti.inputs.sources.masks import read_vignette
@@ -71,7 +72,7 @@ class AriaRecording(ImageSource):
         self.T_device_camera = np.asarray(fisheye.get_transform_device_camera().to_matrix())
 
         raw = self._recorded(0)
-        width, height = (int(value) for value in fisheye.get_image_size())
+        width, height = map(int, fisheye.get_image_size())
         if raw.shape[:2] != (height, width):
             raise InputError(
                 f"{path}: images of {RGB} are {raw.shape[1]}x{raw.shape[0]}, their calibration is for {width}x{height}"
@@ -82,7 +83,18 @@ class AriaRecording(ImageSource):
         cx, cy = (float(value) for value in camera.get_principal_point())  # with pixel centres at whole numbers
         self.intrinsics = Intrinsics(PinholeCamera(fx, fy, cx + 0.5, cy + 0.5, pinhole.width, pinhole.height))
         self._size = (pinhole.width, pinhole.height)
-        self.vignette = self._light(mask, width, height)
+        covered = self._rectification.covered
+        if mask is not None:
+            light = read_vignette(mask)
+            if light.shape[:2] != (height, width):
+                raise InputError(
+                    f"{mask} is {light.shape[1]}x{light.shape[0]}, the recorded images are {width}x{height}: give "
+                    "Aria's mask of that size (rgb_vignetting_half_reso_mask.png is for 1408, ..._full_reso_mask.png "
+                    "for 2880)"
+                )
+            self.vignette = np.where(covered[..., None], np.clip(self._rectification(light), 0.0, 1.0), 0.0)
+        elif not covered.all():
+            self.vignette = np.repeat(covered[..., None], 3, axis=2).astype(np.float32)
         self.add_note(
             f"{path.name} is undistorted to {pinhole.width}x{pinhole.height}, f = {pinhole.focal:g} px, and lies on "
             "its side as it was recorded: the scene's up is the image's left"
@@ -117,19 +129,6 @@ class AriaRecording(ImageSource):
         if image is None or image.dtype != np.uint8:
             raise InputError(f"{self.path}: image {index} of {RGB} cannot be decoded; the recording is damaged there")
         return image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
-
-    def _light(self, mask: Path | None, width: int, height: int) -> NDArray[np.float32] | None:
-        """Compute the attribute `vignette`."""
-        covered = self._rectification.covered
-        if mask is None:
-            return None if covered.all() else np.repeat(covered[..., None], 3, axis=2).astype(np.float32)
-        light = read_vignette(mask)
-        if light.shape[:2] != (height, width):
-            raise InputError(
-                f"{mask} is {light.shape[1]}x{light.shape[0]}, the recorded images are {width}x{height}: give Aria's "
-                "mask of that size (rgb_vignetting_half_reso_mask.png is for 1408, ..._full_reso_mask.png for 2880)"
-            )
-        return np.where(covered[..., None], np.clip(self._rectification(light), 0.0, 1.0), 0.0)
 
 
 class _Rectification:
@@ -166,24 +165,18 @@ class _Rectification:
 
 def _opened(data_provider: Any, path: Path) -> tuple[Any, Any]:
     """Open a recording with the library's module. Returns its data provider and the id of the RGB stream."""
-    if not path.is_file():
-        raise InputError(f"{path}: no such VRS file (source.path)")
-    try:
-        with _quiet():
-            provider = data_provider.create_vrs_data_provider(str(path))
-    except RuntimeError:  # for example, the file ends before its configuration
-        provider = None
-    if provider is None:
-        raise InputError(f"{path}: not a VRS recording, or it is cut off before its first image; copy it again")
+    with reading(path, " (source.path)"), _quiet():
+        open_file(path).close()
+        provider = data_provider.create_vrs_data_provider(str(path))
+        if provider is None:
+            raise ValueError("it is no VRS recording, or is cut off before its first image")
     labels = [provider.get_label_from_stream_id(stream) for stream in provider.get_all_streams()]
     stream = provider.get_stream_id_from_label(RGB) if RGB in labels else None
-    if stream is None:
+    if stream is None or provider.get_num_data(stream) == 0:
         raise InputError(
-            f"{path}: holds no stream {RGB}, which the map is made of; it holds {', '.join(labels) or 'none'}: "
-            "record with a profile that has RGB"
+            f"{path}: holds no image of {RGB}, which the map is made of, only {', '.join(labels) or 'nothing'}: record "
+            "with a profile that has RGB, or copy the file again"
         )
-    if provider.get_num_data(stream) == 0:
-        raise InputError(f"{path}: holds no image of {RGB}, which the map is made of; is the file cut off?")
     return provider, stream
 
 
