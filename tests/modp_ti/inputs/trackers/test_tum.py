@@ -183,7 +183,7 @@ def test_points_of_other_programs_are_read_and_those_with_nan_left_out(posed, fo
 def test_a_pcd_that_is_cut_off_or_compressed_is_named(posed):
     whole = _pcd(posed.xyz, "binary")
     for data, said in (
-        (whole[:-9], "cut off"),
+        (whole[:-9], "damaged"),
         (whole.replace(b"DATA binary", b"DATA binary_compressed"), "compressed"),
     ):
         (posed.root / "cloud.pcd").write_bytes(data)
