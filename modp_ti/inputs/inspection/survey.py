@@ -13,7 +13,7 @@ from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from modp_ti.inputs.inspection.conventions import CONVENTIONS, Convention
 from modp_ti.inputs.multiview.features import Features, detect_features, match_anywhere
-from modp_ti.inputs.multiview.reprojection import estimated
+from modp_ti.inputs.multiview.reprojection import estimated, pixel_errors
 from pipelines.select.gate import sharpness
 
 # At PLACES frames of the sequence, features are matched with the frames of the same view GAPS times further on.
@@ -162,11 +162,7 @@ def _reprojection_errors(frame: TrackedFrame, convention: Convention) -> NDArray
     if convention.shift:  # the points are not those of that image
         return np.full(len(frame.points), np.inf, dtype=np.float32)
     T, camera = convention.pose(frame.T_camera_world), convention.camera(frame.camera)
-    p = frame.points.xyz @ T[:3, :3].T + T[:3, 3]
-    errors = np.full(len(p), np.inf, dtype=np.float32)
-    before = p[:, 2] > 1e-9
-    errors[before] = np.linalg.norm(camera.project(p[before]) - frame.points.pixels[before], axis=1)
-    return errors
+    return pixel_errors(camera, T, frame.points.xyz, frame.points.pixels).astype(np.float32)
 
 
 def _thumbnail(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cached_property
 
 import cv2
 import numpy as np
@@ -40,6 +39,7 @@ class Frame:
         valid: (H, W), False where no features may be tracked; None for everywhere.
         ids: (N,) ids of its features.
         pixels: (N, 2) their positions.
+        features: Its SIFT features; None until they are needed.
     """
 
     number: int
@@ -47,11 +47,15 @@ class Frame:
     valid: NDArray[np.bool_] | None = None
     ids: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     pixels: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 2)))
+    features: Features | None = None
 
-    @cached_property
+    @property
     def described(self) -> Features:
         """Its SIFT features, detected when they are first needed."""
-        return describe(self.grey)
+        if self.features is None:
+            colour = np.repeat(self.grey[..., None], 3, axis=2)
+            self.features = detect_features(colour, side=DESCRIBED_SIDE)
+        return self.features
 
     def track(self, other: Frame, guess: NDArray[np.float64] | None = None) -> None:
         """Replace the features by those of another frame that optical flow finds in this one.
@@ -83,11 +87,6 @@ class LocalisedFrame(Frame):
     """
 
     T_camera_world: NDArray[np.float64] = field(kw_only=True)
-
-
-def describe(grey: NDArray[np.uint8]) -> Features:
-    """SIFT features of a tracked image (H, W) uint8."""
-    return detect_features(np.repeat(grey[..., None], 3, axis=2), side=DESCRIBED_SIDE)
 
 
 def flow(

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from modp_ti.inputs.klt.camera import Lens
 from modp_ti.inputs.klt.frame import WANTED, Frame
-from modp_ti.inputs.klt.landmark_map import Keyframe, LandmarkMap, triangulated
+from modp_ti.inputs.klt.landmark_map import LandmarkMap, triangulated
 from modp_ti.inputs.multiview.features import match_anywhere
 from modp_ti.inputs.multiview.reprojection import estimated, pose_from_points, ray_errors
 
@@ -118,9 +118,7 @@ class Initialisation:
             if found is not None and found[1].sum() >= max(FEWEST_SHARED // 2, 0.5 * known.sum()):
                 poses[i] = found[0]
         for i in sorted(poses):
-            seen = self.frames[i]
-            rays = lens.rays(seen.pixels)
-            landmarks.add_keyframe(Keyframe(seen.number, poses[i], seen.grey, seen.ids, seen.pixels, rays))
+            landmarks.add_keyframe(self.frames[i], poses[i])
         every = range(len(poses))
         for steps in (30, 30, 15):
             if not np.isfinite(landmarks.adjust(every, steps=steps)):

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from fields.geometry.se3 import inverse_se3, moved_points, moved_pose, scale_of
 from modp_ti.inputs.klt.camera import Lens
-from modp_ti.inputs.klt.frame import LocalisedFrame
+from modp_ti.inputs.klt.frame import Frame, LocalisedFrame
 from modp_ti.inputs.multiview.bundle_adjustment import Refinable, adjusted_apart, adjusted_bundle
 from modp_ti.inputs.multiview.features import Features
 from modp_ti.inputs.multiview.reprojection import ray_errors
@@ -34,30 +34,25 @@ LANDMARKS = {
 
 
 @dataclass
-class Keyframe:
-    """A keyframe of the map.
+class Keyframe(LocalisedFrame):
+    """A keyframe of the map. Its `ids` are of the features that it sees, triangulated or not.
 
     Attributes:
-        number: Number of the frame.
-        T_camera_world: (4, 4).
-        grey: (H, W) uint8.
-        ids: (N,) int64 of the features that it sees, triangulated or not.
-        pixels: (N, 2) their positions.
-        rays: (N, 2) their undistorted normalised coordinates.
-        described: Its M SIFT features; None until they are needed.
+        rays: (N, 2) undistorted normalised coordinates of its features.
         described_ids: (M,) the feature id of each SIFT feature, -1 for none.
         scale: What the scale of the map around it has grown by since it was made.
     """
 
-    number: int
-    T_camera_world: NDArray[np.float64]
-    grey: NDArray[np.uint8]
-    ids: NDArray[np.int64]
-    pixels: NDArray[np.float64]
-    rays: NDArray[np.float64]
-    described: Features | None = None
+    rays: NDArray[np.float64] = field(kw_only=True)
     described_ids: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     scale: float = 1.0
+
+    @property
+    def described(self) -> Features:
+        """Its SIFT features, which have no ids when they are detected."""
+        if self.features is None:
+            self.described_ids = np.full(len(super().described.pixels), -1, dtype=np.int64)
+        return super().described
 
     @property
     def centre(self) -> NDArray[np.float64]:
@@ -129,11 +124,14 @@ class LandmarkMap:
         """Index of the keyframe that is the frame of this number, or else of the last one before; -1 for none."""
         return bisect_right(self.keyframes, number, key=lambda keyframe: keyframe.number) - 1
 
-    def add_keyframe(self, keyframe: Keyframe) -> int:
-        """Append a keyframe and return its index."""
-        self.keyframes.append(keyframe)
+    def add_keyframe(self, frame: Frame, T_camera_world: NDArray[np.float64]) -> int:
+        """Append a frame with its pose (4, 4) as a keyframe, and return its index."""
+        rays = self.lens.rays(frame.pixels)
+        self.keyframes.append(
+            Keyframe(frame.number, frame.grey, None, frame.ids, frame.pixels, T_camera_world=T_camera_world, rays=rays)
+        )
         k = len(self.keyframes) - 1
-        self._note_observations(k, keyframe.ids, keyframe.pixels)
+        self._note_observations(k, frame.ids, frame.pixels)
         return k
 
     def absorb(self, other: LandmarkMap, S_self_other: NDArray[np.float64]) -> int:

@@ -186,8 +186,8 @@ class LoopClosing:
             self._tracking = None
             return
         for keyframe, copy in zip(tracking.map.keyframes, search.copy.keyframes, strict=False):
-            if keyframe.described is None and copy.described is not None:
-                keyframe.described, keyframe.described_ids = copy.described, np.full_like(copy.described_ids, -1)
+            if keyframe.features is None and copy.features is not None:
+                keyframe.features, keyframe.described_ids = copy.features, np.full_like(copy.described_ids, -1)
         if tracking.map.lens is not search.copy.lens:
             return
         if after is not None:
@@ -315,9 +315,9 @@ def _take_observations(landmarks: LandmarkMap, before: LandmarkMap, after: Landm
         made = ~np.isin(new.ids, old.ids) & ~np.isin(id_of[new.ids], keyframe.ids)
         ids, pixels = id_of[new.ids[made]], new.pixels[made]
         landmarks.observe(k, ids, pixels)
-        if new.described is None:
+        if new.features is None:
             continue
-        if keyframe.described is None:
-            keyframe.described, keyframe.described_ids = new.described, np.full_like(new.described_ids, -1)
+        if keyframe.features is None:
+            keyframe.features, keyframe.described_ids = new.features, np.full_like(new.described_ids, -1)
         given = (new.described_ids >= 0) & (keyframe.described_ids < 0)
         keyframe.described_ids[given] = id_of[new.described_ids[given]]

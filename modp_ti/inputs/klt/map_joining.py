@@ -15,7 +15,6 @@ from modp_ti.inputs.klt.recognition import (
     PlaceIndex,
     Recognition,
     agreeing,
-    described_keyframe,
     inherited,
     recognised,
     world_points,
@@ -62,7 +61,7 @@ def _connect(landmarks: LandmarkMap, found: Recognition) -> tuple[Keyframe, NDAr
     keyframe = landmarks.keyframes[by]
     frame = keyframe.frame()
     before = len(frame.ids)
-    frame.append(*inherited(landmarks, of, described_keyframe(keyframe), found.pairs, frame.T_camera_world))
+    frame.append(*inherited(landmarks, of, keyframe.described, found.pairs, frame.T_camera_world))
     frame.append(*searched(landmarks, frame))
     ids = frame.ids[before:]
     landmarks.observe(by, ids, frame.pixels[before:])
@@ -136,7 +135,7 @@ def joint_similarity(
         a, b = each.pairs.T
         there, here = world_points(landmarks, each.of)[a], world_points(own, each.by)[b]
         good = np.isfinite(np.c_[there, here]).all(axis=1)
-        rays = landmarks.lens.rays(described_keyframe(each.of).pixels[a[good]])
+        rays = landmarks.lens.rays(each.of.described.pixels[a[good]])
         matched.append((there[good], here[good], rays))
     options = pycolmap.RANSACOptions()
     options.max_error = MAX_ERROR_3D * float(np.median([each.depth for each in found]))

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.geometry.se3 import inverse_se3, motion_around, moved_pose, scale_of
-from modp_ti.inputs.klt.frame import describe
 from modp_ti.inputs.klt.landmark_map import Keyframe, LandmarkMap
 from modp_ti.inputs.multiview.appearance import nearest_words, vlad
 from modp_ti.inputs.multiview.features import Features, epipolar_lines, essential_matrix, match_anywhere
@@ -60,7 +59,7 @@ def place_by_features(
         T_camera_world (4, 4) of the frame, and the matches (M, 2) that agree: indices of SIFT features in the keyframe
         and in the frame. None if too few agree.
     """
-    pairs = match_anywhere(described_keyframe(keyframe), features)
+    pairs = match_anywhere(keyframe.described, features)
     if len(pairs) < FEWEST:
         return None
     xyz = world_points(landmarks, keyframe)[pairs[:, 0]]
@@ -95,7 +94,7 @@ def inherited(
         Ids (N,) and their pixels (N, 2) in the frame.
     """
     keyframe = landmarks.keyframes[k]
-    described = described_keyframe(keyframe)
+    described = keyframe.described
     a, b = described.pixels[pairs[:, 0]], features.pixels[pairs[:, 1]]
     rays_a, rays_b = landmarks.lens.rays(a), landmarks.lens.rays(b)
     lines = epipolar_lines(essential_matrix(keyframe.T_camera_world, T), rays_a)
@@ -111,21 +110,13 @@ def inherited(
     return keyframe.described_ids[slots], b
 
 
-def described_keyframe(keyframe: Keyframe) -> Features:
-    """SIFT features of a keyframe, detected when they are first needed."""
-    if keyframe.described is None:
-        keyframe.described = describe(keyframe.grey)
-        keyframe.described_ids = np.full(len(keyframe.described.pixels), -1, dtype=np.int64)
-    return keyframe.described
-
-
 def world_points(landmarks: LandmarkMap, keyframe: Keyframe) -> NDArray[np.float64]:
     """World points (M, 3) of a keyframe's SIFT features; NaN where the depth is unknown.
 
     A feature that is a landmark has its position. Any other takes the depth of a landmark at the same pixel, or of the
     landmarks around it if they agree.
     """
-    pixels, ids = described_keyframe(keyframe).pixels, keyframe.described_ids
+    pixels, ids = keyframe.described.pixels, keyframe.described_ids
     xyz = np.full((len(pixels), 3), np.nan)
     own = np.flatnonzero(ids >= 0)
     own = own[landmarks.known[ids[own]]]
@@ -169,7 +160,7 @@ class PlaceIndex:
         if not others:
             return []
         if len(others) + 1 >= 2 * self._trained_on:
-            rows = [described_keyframe(each).descriptors for each in (keyframe, *others)]
+            rows = [each.described.descriptors for each in (keyframe, *others)]
             stride = max(1, -(-sum(map(len, rows)) // TRAINED_ON))
             self._words = vocabulary(np.concatenate(rows)[::stride], WORDS, self._seed)
             self._trained_on = len(rows)
@@ -181,7 +172,7 @@ class PlaceIndex:
     def _vector(self, keyframe: Keyframe) -> NDArray[np.float32]:
         vector = self._vectors.get(keyframe.number)
         if vector is None:
-            vector = self._vectors[keyframe.number] = vlad(described_keyframe(keyframe).descriptors, self._words)
+            vector = self._vectors[keyframe.number] = vlad(keyframe.described.descriptors, self._words)
         return vector
 
 
@@ -233,7 +224,7 @@ def recognised(landmarks: LandmarkMap, of: Keyframe, own: LandmarkMap, by: Keyfr
         by: Another keyframe.
         seed: Seed of RANSAC.
     """
-    placed = place_by_features(landmarks, of, described_keyframe(by), seed)
+    placed = place_by_features(landmarks, of, by.described, seed)
     if placed is None:
         return None
     T, pairs = placed
@@ -251,7 +242,7 @@ def recognised(landmarks: LandmarkMap, of: Keyframe, own: LandmarkMap, by: Keyfr
     if np.median(np.abs(ratio - middle)) > LARGEST_SPREAD:
         return None
     S = motion_around(by.T_camera_world, T, float(np.exp(middle)))
-    rays = landmarks.lens.rays(described_keyframe(of).pixels[pairs[both, 0]])
+    rays = landmarks.lens.rays(of.described.pixels[pairs[both, 0]])
     error = ray_errors(of.T_camera_world, here @ S[:3, :3].T + S[:3, 3], rays) * landmarks.lens.focal
     if (error < MAX_ERROR_BETWEEN).mean() < LEAST_SHARE:
         return None

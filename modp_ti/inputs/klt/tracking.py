@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from fields.geometry.se3 import inverse_se3, orthonormalised, scale_of
 from modp_ti.inputs.klt.camera import CameraRefinement
 from modp_ti.inputs.klt.frame import Frame, LocalisedFrame
-from modp_ti.inputs.klt.landmark_map import Keyframe, LandmarkMap
+from modp_ti.inputs.klt.landmark_map import LandmarkMap
 from modp_ti.inputs.klt.localisation import FEWEST, SIGMA, localised, predicted_pixels, realigned, searched
 from modp_ti.inputs.klt.recognition import inherited, place_by_features, thumbnail
 from modp_ti.inputs.multiview.bundle_adjustment import Refinable
@@ -216,10 +216,7 @@ class Tracking:
         return self._insert_keyframe(self._localised(frame, frame.T_camera_world) or frame)
 
     def _insert_keyframe(self, frame: LocalisedFrame) -> View:
-        rays = self.map.lens.rays(frame.pixels)
-        k = self.map.add_keyframe(
-            Keyframe(frame.number, frame.T_camera_world, frame.grey, frame.ids, frame.pixels, rays)
-        )
+        k = self.map.add_keyframe(frame, frame.T_camera_world)
         self._replenish(frame)
         self.map.triangulate(k)
         self._adjust()

@@ -9,6 +9,7 @@ from typing import ParamSpec, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import exp_se3, orthonormalised
 
 POSE_STEPS = 10
@@ -63,6 +64,20 @@ def ray_errors(
         Errors (N,), infinite for points behind the camera.
     """
     return _errors(xyz @ T_camera_world[:3, :3].T + T_camera_world[:3, 3], rays)
+
+
+def pixel_errors(
+    camera: PinholeCamera, T_camera_world: NDArray[np.float64], xyz: NDArray[np.floating], pixels: NDArray[np.floating]
+) -> NDArray[np.float64]:
+    """Reprojection errors (N,) [px] of points (N, 3) seen at pixels (N, 2) by a pinhole camera at a pose (4, 4).
+
+    They are infinite for points behind the camera.
+    """
+    p = xyz @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]
+    before = p[:, 2] > 1e-9
+    error = np.full(len(p), np.inf)
+    error[before] = np.linalg.norm(camera.project(p[before]) - pixels[before], axis=1)
+    return error
 
 
 def point_errors(poses: NDArray[np.float64], seen: Observations, xyz: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.geometry.camera import PinholeCamera, pixel_jacobian
-from modp_ti.inputs.multiview.reprojection import estimated
+from modp_ti.inputs.multiview.reprojection import estimated, pixel_errors
 
 CONFIDENCE = 0.9999
 MOST_TRIALS = 5000
@@ -82,18 +82,7 @@ def resect(
         camera = PinholeCamera(f, f, camera.cx, camera.cy, camera.width, camera.height)
     if not np.isfinite(T).all():
         return None
-    return Resection(T, camera, reprojection_errors(T, xyz, pixels, camera) <= max_error)
-
-
-def reprojection_errors(
-    T_camera_world: NDArray[np.float64], xyz: NDArray[np.float64], pixels: NDArray[np.float64], camera: PinholeCamera
-) -> NDArray[np.float64]:
-    """Reprojection errors (N,) [px] of points (N, 3) seen at pixels (N, 2); infinite behind the camera."""
-    p = xyz @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]
-    before = p[:, 2] > 0
-    error = np.full(len(p), np.inf)
-    error[before] = np.linalg.norm(camera.project(p[before]) - pixels[before], axis=1)
-    return error
+    return Resection(T, camera, pixel_errors(camera, T, xyz, pixels) <= max_error)
 
 
 def pose_covariance(

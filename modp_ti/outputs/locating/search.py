@@ -13,8 +13,9 @@ from fields.frames.tracked_frame import SparsePoints
 from fields.geometry.camera import PinholeCamera
 from modp_ti.inputs.multiview.appearance import Appearance
 from modp_ti.inputs.multiview.features import Features, detect_features, match_anywhere
+from modp_ti.inputs.multiview.reprojection import pixel_errors
 from modp_ti.outputs.formats.mesh import without_edges
-from modp_ti.outputs.locating.resection import Resection, pose_covariance, reprojection_errors, resect
+from modp_ti.outputs.locating.resection import Resection, pose_covariance, resect
 from modp_ti.outputs.playback.map_renderer import MapRenderer, eight_bits
 from pipelines.optimise.poses import ViewAlignment
 from pipelines.render.renderer import RenderedView
@@ -202,7 +203,7 @@ class Search:
     ) -> Found | str:
         """Compare the picture with the render from a pose. Returns why the pose cannot be right, if it cannot."""
         xyz, pixels = matched(rendered_features(self._renderer, camera, T), features)
-        inlier = reprojection_errors(T, xyz, pixels, camera) <= MAX_ERROR_THERE
+        inlier = pixel_errors(camera, T, xyz, pixels) <= MAX_ERROR_THERE
         # A place with several orientations is several features.
         inliers = len(np.unique(pixels[inlier], axis=0))
         if inliers < FEWEST_THERE:

@@ -15,8 +15,7 @@ from fields.geometry.se3 import exp_se3
 from modp_ti.inputs.inspection.conventions import CONVENTIONS, STATED, Convention
 from modp_ti.inputs.inspection.findings import Severity, verdict
 from modp_ti.inputs.inspection.geometry import epipolar_score, judge_geometry, measure_geometry
-from modp_ti.inputs.inspection.survey import MatchedPair, matched_pair, survey
-from modp_ti.inputs.multiview.features import Features
+from modp_ti.inputs.inspection.survey import MatchedPair, survey
 
 CAMERA = PinholeCamera(300.0, 305.0, 161.0, 118.0, 320, 240)
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -145,16 +144,6 @@ def test_poses_of_the_next_image_are_told_from_others(shift: int) -> None:
     (found,) = judge_geometry(measure_geometry(seen))
     assert found.severity is Severity.UNUSABLE
     assert found.code == {1: "poses_one_image_late", -1: "poses_one_image_early"}[shift]
-
-
-def test_a_pair_for_which_the_estimator_fails_has_no_geometry(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fails(*_: object) -> None:
-        raise cv2.error("no model")
-
-    monkeypatch.setattr(cv2, "findFundamentalMat", fails)
-    rng = np.random.default_rng(0)
-    found = Features(rng.uniform(0, 200, (80, 2)), rng.integers(0, 255, (80, 128), dtype=np.uint8), 1.0)
-    assert matched_pair(0, found, 1, found) is None
 
 
 def test_pixels_that_were_computed_from_the_poses_prove_nothing() -> None:

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import exp_se3, inverse_se3, moved_points, moved_pose, scale_of
 from modp_ti.inputs.klt.camera import Lens
-from modp_ti.inputs.klt.frame import corners, flow
+from modp_ti.inputs.klt.frame import Frame, corners, flow
 from modp_ti.inputs.klt.initialisation import two_views
-from modp_ti.inputs.klt.landmark_map import Keyframe, LandmarkMap, triangulated
+from modp_ti.inputs.klt.landmark_map import LandmarkMap, triangulated
 from modp_ti.inputs.klt.localisation import align_landmarks, reference_views
 from modp_ti.inputs.klt.loop_closing import carry_over
 from modp_ti.inputs.klt.recognition import PlaceIndex, Recognition, agreeing, recognised
@@ -44,7 +44,7 @@ def way(i: int) -> NDArray[np.float64]:
 def add_keyframe(landmarks: LandmarkMap, number: int, T: NDArray[np.float64], ids: NDArray[np.int64]) -> None:
     """A keyframe that sees landmarks exactly where the world has them."""
     at = pixels(T, landmarks.xyz[ids])
-    landmarks.add_keyframe(Keyframe(number, T, np.zeros((480, 640), np.uint8), ids, at, landmarks.lens.rays(at)))
+    landmarks.add_keyframe(Frame(number, np.zeros((480, 640), np.uint8), None, ids, at), T)
 
 
 def small_map(lens: Lens = LENS, numbers: Sequence[int] = range(6)) -> tuple[LandmarkMap, NDArray[np.float64]]:
@@ -223,7 +223,7 @@ def mapped(box_room, poses: list[NDArray[np.float64]], world: NDArray[np.float64
         local = box_room.camera.unproject(at, box_room.depth(T, at))
         landmarks.xyz[ids] = moved_points(world, (local - T[:3, 3]) @ T[:3, :3])
         landmarks.known[ids] = True
-        landmarks.add_keyframe(Keyframe(first + i, moved_pose(world, T), grey, ids, at, landmarks.lens.rays(at)))
+        landmarks.add_keyframe(Frame(first + i, grey, None, ids, at), moved_pose(world, T))
     return landmarks
 
 

@@ -51,8 +51,8 @@ def test_a_pose_graph_takes_the_drift_of_direction_and_scale_out_of_a_loop():
 
 
 def bend(number: int, odometry: Odometry) -> None:
-    """Give the map drift after frame 108."""
-    if number != 108:
+    """Give the map drift after frame 80."""
+    if number != 80:
         return
     tracking = odometry.tracking
     assert tracking is not None and tracking._last is not None
@@ -66,7 +66,7 @@ def bend(number: int, odometry: Odometry) -> None:
 
 @pytest.mark.slow
 def test_a_walk_that_comes_home_with_drift_is_closed_however_long_the_thread_takes(box_room, monkeypatch):
-    truth = round_walk(132, 1.15)
+    truth = round_walk(100, 1.12)
     greys = [box_room.grey(T) for T in truth]
     found = followed(box_room, greys, bend, begins_anew_after=10, loops=True)
     assert found.odometry.loops >= 1
