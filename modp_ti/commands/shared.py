@@ -20,10 +20,9 @@ from typer.core import TyperCommand, TyperGroup
 from fields.runtime.engine import EngineError
 from fields.runtime.process import why_too_narrow
 from modp_ti.config.presets import PRESETS
-from modp_ti.files.errors import InputError
+from modp_ti.files.errors import InputError, without_secrets
 from modp_ti.files.processes import EndingSignals, exit_code
 from modp_ti.files.terminal import own_terminal, shown
-from modp_ti.files.urls import without_secrets
 
 if TYPE_CHECKING:
     from rich.console import Console

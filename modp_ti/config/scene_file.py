@@ -19,9 +19,8 @@ from modp_ti.config.presets import PRESETS, with_defaults
 from modp_ti.config.settings import WITH_SECRETS, SceneConfig
 from modp_ti.files import read_text
 from modp_ti.files.atomic import replace_text
-from modp_ti.files.errors import InputError
+from modp_ti.files.errors import FROM_FILE, InputError, shown_url
 from modp_ti.files.terminal import require_text
-from modp_ti.files.urls import FROM_FILE, shown_url
 from modp_ti.files.yaml_text import parse_yaml
 
 M = TypeVar("M", bound=BaseModel)

@@ -18,8 +18,7 @@ from fields.runtime.process import available_cores
 from modp_ti.config.camera_settings import BagImagesSettings, IntrinsicsSettings, PanoramaSettings, VrsSettings
 from modp_ti.config.combinations import refuse_exclusions
 from modp_ti.config.output_settings import EvaluationSettings, ExportSettings, ViewSettings
-from modp_ti.files.errors import InputError
-from modp_ti.files.urls import shown_url
+from modp_ti.files.errors import InputError, shown_url
 from modp_ti.inputs.reader import TrackerSettings
 from modp_ti.inputs.readers import READERS, SOURCES
 from pipelines.settings import MappingSettings, OfflineSettings, RefineSettings, StrictModel

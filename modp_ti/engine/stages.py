@@ -24,8 +24,7 @@ from modp_ti.engine.resume import Recovery, replay, saving
 from modp_ti.engine.second_visit import EarlierMap, open_earlier_map
 from modp_ti.engine.snapshot import Checkpointer, Snapshot
 from modp_ti.engine.stream import Conductor, FramesAhead, Observer, open_observer
-from modp_ti.files.errors import InputError
-from modp_ti.files.urls import without_secrets
+from modp_ti.files.errors import InputError, without_secrets
 from modp_ti.inputs.inspection.geometry import require_fitting
 from modp_ti.inputs.opening import open_tracker
 from modp_ti.inputs.protocol import Event, Tracker

@@ -8,9 +8,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from modp_ti.files.errors import InputError
+from modp_ti.files.errors import InputError, actual_url
 from modp_ti.files.run_folder import PRIVATE
-from modp_ti.files.urls import actual_url
 
 LAST = "metrics.json"
 

@@ -16,15 +16,13 @@ from urllib.parse import urlsplit
 
 from modp_ti.config.scene_file import load_scene, scene_from_data
 from modp_ti.config.settings import SceneConfig
-from modp_ti.files.errors import InputError, UnreadableImageError
+from modp_ti.files.errors import InputError, UnreadableImageError, actual_url, shown_url
 from modp_ti.files.file_tree import ARCHIVES
 from modp_ti.files.terminal import require_text
-from modp_ti.files.urls import actual_url, shown_url
 from modp_ti.inputs.opening import is_panoramic, open_source, recognised_kind
 from modp_ti.inputs.reader import kind_of
 from modp_ti.inputs.readers import READERS, SOURCES
-from modp_ti.inputs.sources.image_folder import IMAGE_SUFFIXES, NOT_READ, ImageFolder
-from modp_ti.inputs.sources.listed_images import ListedImages
+from modp_ti.inputs.sources.image_folder import IMAGE_SUFFIXES, NOT_READ, ImageFolder, ListedImages
 from modp_ti.inputs.sources.video_file import VIDEO_SUFFIXES, is_video
 
 OUTPUTS = Path("out")

@@ -21,7 +21,7 @@ from modp_ti.files.file_tree import SETTING, FileTree
 from modp_ti.files.trajectory import checked_pose
 from modp_ti.inputs.sources.distortion import NO_DISTORTION, Distortion
 from modp_ti.inputs.sources.image_header import read_image_header
-from modp_ti.inputs.sources.intrinsics import require_plausible
+from modp_ti.inputs.sources.undistortion import require_plausible
 
 # From OpenGL camera axes (x right, y up, z back), which ARKit has, to OpenCV axes. The matrix is its own inverse.
 OPENCV_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])

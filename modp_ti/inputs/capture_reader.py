@@ -23,11 +23,10 @@ from modp_ti.inputs.depth_maps import depth_points
 from modp_ti.inputs.posed_recording import PosedRecording, StoredView
 from modp_ti.inputs.protocol import Progress, Tracker
 from modp_ti.inputs.reader import PosesSettings, kind_of
-from modp_ti.inputs.sources.intrinsics import Intrinsics
-from modp_ti.inputs.sources.listed_images import ListedImages
+from modp_ti.inputs.sources.image_folder import ListedImages
 from modp_ti.inputs.sources.orientation import Turn
 from modp_ti.inputs.sources.protocol import ImageSource
-from modp_ti.inputs.sources.undistortion import both_valid
+from modp_ti.inputs.sources.undistortion import Intrinsics, both_valid
 from modp_ti.inputs.sources.video_file import VideoFile
 
 if TYPE_CHECKING:

@@ -5,17 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from modp_ti.files.errors import InputError, UnreadableImageError
+from modp_ti.files.errors import InputError, UnreadableImageError, actual_url
 from modp_ti.files.file_tree import ARCHIVES, open_tree
 from modp_ti.files.reading import reading
-from modp_ti.files.urls import actual_url
 from modp_ti.inputs.protocol import Progress, Tracker
-from modp_ti.inputs.sources.image_folder import ImageFolder
-from modp_ti.inputs.sources.intrinsics import given_intrinsics
-from modp_ti.inputs.sources.listed_images import ListedImages
+from modp_ti.inputs.sources.image_folder import ImageFolder, ListedImages
 from modp_ti.inputs.sources.paced import PacedSource
 from modp_ti.inputs.sources.panorama import PanoramaFaces, looks_panoramic
 from modp_ti.inputs.sources.protocol import ImageSource
+from modp_ti.inputs.sources.undistortion import given_intrinsics
 from modp_ti.inputs.sources.video_file import VIDEO_SUFFIXES, VideoFile, is_video
 
 if TYPE_CHECKING:

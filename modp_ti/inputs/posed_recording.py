@@ -20,7 +20,7 @@ from modp_ti.inputs.opening import open_source
 from modp_ti.inputs.protocol import Progress
 from modp_ti.inputs.replay import PosedImage, ReplayedTracker, is_held_out, readable_sizes
 from modp_ti.inputs.sources import Distortion, FrameReader, Intrinsics, Undistorter
-from modp_ti.inputs.sources.masks import MaskFolder
+from modp_ti.inputs.sources.frame_reader import MaskFolder
 from modp_ti.inputs.sources.orientation import AS_STORED, Turn
 from modp_ti.inputs.sources.protocol import require_intrinsics
 from modp_ti.inputs.sources.undistortion import undistorter_beside

@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.text import Text
 
-from modp_ti.files.urls import without_secrets
+from modp_ti.files.errors import without_secrets
 
 if TYPE_CHECKING:
     from modp_ti.config.settings import SceneConfig

@@ -28,8 +28,8 @@ from modp_ti.inputs.bags.messages import (
 )
 from modp_ti.inputs.bags.transforms import clean, seconds
 from modp_ti.inputs.sources.image_pixels import DEPTHS, used_bits
-from modp_ti.inputs.sources.intrinsics import Intrinsics
 from modp_ti.inputs.sources.protocol import ImageSource
+from modp_ti.inputs.sources.undistortion import Intrinsics
 from modp_ti.inputs.sources.video_file import VideoFile
 
 SAMPLED = 16  # images of 16 bits per channel by which their depth is found

@@ -16,7 +16,7 @@ from modp_ti.inputs.capture import checked_numbers, plausible_camera
 from modp_ti.inputs.sources.distortion import NO_DISTORTION, lens_of_model
 from modp_ti.inputs.sources.image_header import read_image_header, why_undecodable
 from modp_ti.inputs.sources.image_pixels import DEPTHS, decoded, decoded_as, reduced
-from modp_ti.inputs.sources.intrinsics import Intrinsics
+from modp_ti.inputs.sources.undistortion import Intrinsics
 
 DEPTH_ENCODINGS = ("16UC1", "32FC1")
 COMPRESSED = "sensor_msgs/msg/CompressedImage"

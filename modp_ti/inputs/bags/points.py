@@ -28,7 +28,7 @@ from modp_ti.inputs.depth_maps import sampled_points
 from modp_ti.inputs.point_cloud import projected_points
 from modp_ti.inputs.protocol import Progress
 from modp_ti.inputs.replay import PosedImage
-from modp_ti.inputs.sources.intrinsics import Intrinsics
+from modp_ti.inputs.sources.undistortion import Intrinsics
 
 if TYPE_CHECKING:
     from modp_ti.inputs.readers.bag import BagSettings

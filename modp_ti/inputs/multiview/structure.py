@@ -15,7 +15,7 @@ from fields.geometry.se3 import inverse_se3
 from modp_ti.inputs.multiview.features import Features
 from modp_ti.inputs.multiview.reprojection import estimated
 from modp_ti.inputs.protocol import Progress
-from modp_ti.inputs.sources.intrinsics import Intrinsics
+from modp_ti.inputs.sources.undistortion import Intrinsics
 
 if TYPE_CHECKING:
     from modp_ti.files.quiet_pycolmap import pycolmap

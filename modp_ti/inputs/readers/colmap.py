@@ -20,8 +20,8 @@ from modp_ti.inputs.reader import GivenPosesSettings, RecordedSettings
 from modp_ti.inputs.replay import PosedImage, points_inside
 from modp_ti.inputs.sources import Distortion
 from modp_ti.inputs.sources.distortion import colmap_intrinsics
-from modp_ti.inputs.sources.intrinsics import require_plausible
 from modp_ti.inputs.sources.orientation import Turn
+from modp_ti.inputs.sources.undistortion import require_plausible
 
 TOPS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
 

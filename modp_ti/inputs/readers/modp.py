@@ -22,9 +22,9 @@ from modp_ti.inputs.point_cloud import projected_points, read_npy_points
 from modp_ti.inputs.posed_recording import PosedRecording, read_entries
 from modp_ti.inputs.reader import RecordedSettings
 from modp_ti.inputs.replay import PosedImage
+from modp_ti.inputs.sources.frame_reader import read_vignette
 from modp_ti.inputs.sources.image_folder import ImageFolder
-from modp_ti.inputs.sources.intrinsics import Intrinsics
-from modp_ti.inputs.sources.masks import read_vignette
+from modp_ti.inputs.sources.undistortion import Intrinsics
 
 if TYPE_CHECKING:
     from modp_ti.config.settings import SourceSettings

@@ -16,8 +16,8 @@ from modp_ti.files.number_rows import read_number_rows
 from modp_ti.inputs.capture import opencv_pose
 from modp_ti.inputs.posed_recording import PosedRecording
 from modp_ti.inputs.reader import GivenPosesSettings
-from modp_ti.inputs.sources.intrinsics import Intrinsics
-from modp_ti.inputs.sources.listed_images import ListedImages
+from modp_ti.inputs.sources.image_folder import ListedImages
+from modp_ti.inputs.sources.undistortion import Intrinsics
 
 if TYPE_CHECKING:
     from modp_ti.config.settings import SourceSettings

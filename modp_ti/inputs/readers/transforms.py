@@ -18,9 +18,9 @@ from modp_ti.inputs.posed_recording import PANORAMAS, PosedRecording, StoredView
 from modp_ti.inputs.reader import RecordedSettings
 from modp_ti.inputs.sources import Distortion, ImageSource
 from modp_ti.inputs.sources.distortion import COEFFICIENTS, colmap_lens
-from modp_ti.inputs.sources.intrinsics import require_plausible
-from modp_ti.inputs.sources.listed_images import ListedImages
-from modp_ti.inputs.sources.masks import MaskFolder
+from modp_ti.inputs.sources.frame_reader import MaskFolder
+from modp_ti.inputs.sources.image_folder import ListedImages
+from modp_ti.inputs.sources.undistortion import require_plausible
 
 if TYPE_CHECKING:
     from modp_ti.config.settings import SourceSettings

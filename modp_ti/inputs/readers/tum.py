@@ -17,8 +17,8 @@ from modp_ti.files.file_tree import FileTree
 from modp_ti.inputs.posed_recording import PosedRecording
 from modp_ti.inputs.reader import TrajectorySettings
 from modp_ti.inputs.sources.distortion import NO_DISTORTION, Distortion
-from modp_ti.inputs.sources.intrinsics import Intrinsics
-from modp_ti.inputs.sources.listed_images import ListedImages
+from modp_ti.inputs.sources.image_folder import ListedImages
+from modp_ti.inputs.sources.undistortion import Intrinsics
 
 if TYPE_CHECKING:
     from modp_ti.config.settings import SourceSettings

@@ -5,9 +5,8 @@ from __future__ import annotations
 from modp_ti.inputs.sources.distortion import NO_DISTORTION, Distortion
 from modp_ti.inputs.sources.frame_reader import FrameReader, Picture
 from modp_ti.inputs.sources.image_folder import ImageFolder
-from modp_ti.inputs.sources.intrinsics import Intrinsics
 from modp_ti.inputs.sources.protocol import ImageSource, require_intrinsics
-from modp_ti.inputs.sources.undistortion import Undistorter
+from modp_ti.inputs.sources.undistortion import Intrinsics, Undistorter
 from modp_ti.inputs.sources.video_file import VideoFile
 
 __all__ = [

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from fields.geometry.camera import PinholeCamera
 from modp_ti.files import open_file, reading
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.sources.intrinsics import Intrinsics
-from modp_ti.inputs.sources.masks import read_vignette
+from modp_ti.inputs.sources.frame_reader import read_vignette
 from modp_ti.inputs.sources.protocol import ImageSource
+from modp_ti.inputs.sources.undistortion import Intrinsics
 
 if TYPE_CHECKING:
     from modp_ti.config.settings import VrsSettings

@@ -19,9 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.runtime.process import has_room
-from modp_ti.files.errors import InputError
+from modp_ti.files.errors import InputError, shown_url
 from modp_ti.files.processes import RecordingInterrupt
-from modp_ti.files.urls import shown_url
 from modp_ti.inputs.sources.backlog import Arrivals, Backlog
 from modp_ti.inputs.sources.image_header import read_image_header
 from modp_ti.inputs.sources.image_pixels import decoded, quiet_opencv

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from fields.geometry.camera import PinholeCamera
 from modp_ti.config.camera_settings import PanoramaSettings
 from modp_ti.files.errors import InputError, UnreadableImageError
-from modp_ti.inputs.sources.intrinsics import Intrinsics
 from modp_ti.inputs.sources.protocol import ImageSource
+from modp_ti.inputs.sources.undistortion import Intrinsics
 
 # Largest relative difference of an image's width from twice its height.
 SHAPE_TOLERANCE = 0.01

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from modp_ti.files.errors import InputError
 from modp_ti.files.terminal import require_text
-from modp_ti.inputs.sources.intrinsics import Intrinsics
 from modp_ti.inputs.sources.orientation import AS_STORED, Turn
+from modp_ti.inputs.sources.undistortion import Intrinsics
 
 if TYPE_CHECKING:
     from modp_ti.inputs.capture import Capture

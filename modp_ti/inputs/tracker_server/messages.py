@@ -16,7 +16,7 @@ from modp_ti.files import LARGEST
 from modp_ti.files.errors import InputError
 from modp_ti.files.trajectory import FARTHEST, checked_pose
 from modp_ti.inputs.sources import NO_DISTORTION, Distortion, Intrinsics
-from modp_ti.inputs.sources.intrinsics import require_plausible
+from modp_ti.inputs.sources.undistortion import require_plausible
 
 MAGIC = b"MODP"
 VERSION = 1

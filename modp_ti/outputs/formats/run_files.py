@@ -25,8 +25,7 @@ from modp_ti.files.errors import InputError
 from modp_ti.inputs.delivered_frames import DeliveredFrames
 from modp_ti.inputs.sources.distortion import NO_DISTORTION, Distortion
 from modp_ti.inputs.sources.image_pixels import decoded_as
-from modp_ti.inputs.sources.intrinsics import Intrinsics, require_plausible
-from modp_ti.inputs.sources.undistortion import Undistorter
+from modp_ti.inputs.sources.undistortion import Intrinsics, Undistorter, require_plausible
 from modp_ti.outputs.evaluation import FrameScore, MapVersion
 from modp_ti.outputs.formats.dataset import write_colmap
 from modp_ti.outputs.formats.splats_ply import write_splats

@@ -18,8 +18,8 @@ from fields.geometry.camera import PinholeCamera
 from fields.runtime.tenancy import Tenant
 from modp_ti.config.scene_file import scene_from_data
 from modp_ti.config.settings import IntrinsicsSettings
-from modp_ti.inputs.sources.intrinsics import Intrinsics, given_intrinsics
-from modp_ti.inputs.sources.listed_images import ListedImages
+from modp_ti.inputs.sources.image_folder import ListedImages
+from modp_ti.inputs.sources.undistortion import Intrinsics, given_intrinsics
 from modp_ti.outputs.locating.search import MapViews, Search, map_depth
 from modp_ti.outputs.locating.world_alignment import PlacedFrame
 from modp_ti.outputs.playback.finished_run import FinishedRun, open_run

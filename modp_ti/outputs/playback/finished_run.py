@@ -16,7 +16,7 @@ from modp_ti.files.reading import reading
 from modp_ti.files.run_folder import require_whole
 from modp_ti.inputs.colmap_model import ModelCamera, read_colmap_model
 from modp_ti.inputs.sources import NO_DISTORTION
-from modp_ti.inputs.sources.intrinsics import require_plausible
+from modp_ti.inputs.sources.undistortion import require_plausible
 from modp_ti.outputs.formats.run_files import FramesRecord, read_frames
 from modp_ti.outputs.formats.splats_ply import read_splats
 from modp_ti.outputs.formats.trajectory import read_trajectory

@@ -22,7 +22,7 @@ from modp_ti.inputs.opening import open_source, open_tracker
 from modp_ti.inputs.protocol import Progress
 from modp_ti.inputs.readers.transforms import TransformsSettings, masks_of_transforms
 from modp_ti.inputs.sources import FrameReader, Picture
-from modp_ti.inputs.sources.intrinsics import Intrinsics
+from modp_ti.inputs.sources.undistortion import Intrinsics
 from modp_ti.outputs.playback.finished_run import FinishedRun, open_run
 
 

@@ -16,7 +16,7 @@ from fields.runtime.engine import engine
 from fields.runtime.process import available_cores
 from modp_ti.config.keys import as_yaml, documented_values
 from modp_ti.config.settings import SceneConfig
-from modp_ti.files.urls import without_secrets
+from modp_ti.files.errors import without_secrets
 from modp_ti.outputs.progress import duration
 from modp_ti.version import __version__
 

@@ -13,7 +13,7 @@ from modp_ti.inputs.multiview.appearance import ALL_PAIRS, image_pairs
 from modp_ti.inputs.multiview.features import Features
 from modp_ti.inputs.multiview.structure import MatchedImage, reconstructed
 from modp_ti.inputs.sources.distortion import NO_DISTORTION, Distortion
-from modp_ti.inputs.sources.intrinsics import Intrinsics
+from modp_ti.inputs.sources.undistortion import Intrinsics
 from modp_ti.outputs.evaluation import umeyama
 from tests.spread import disturbed
 
