@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from fields.runtime.engine import EngineError, engine
-from modp_ti.commands import batch, cameras, check, finished, run, warmup
+from modp_ti.commands import batch, finished, input, run
 from modp_ti.commands.shared import BAD_INPUT, MARKUP, CommandGroup, examples
 from modp_ti.version import __version__
 
@@ -39,9 +39,9 @@ app = typer.Typer(
 def _print_version(asked: bool) -> None:
     if asked:
         try:
-            compiler = str(engine())
+            compiler = engine()
         except EngineError as error:
-            compiler = str(error)
+            compiler = error
         typer.echo(f"modp-ti {__version__} ({compiler})")
         raise typer.Exit
 
@@ -58,14 +58,12 @@ def _options(
         raise typer.Exit(BAD_INPUT)
 
 
-app.command(epilog=run.EXAMPLES)(run.run)
-app.command(epilog=batch.EXAMPLES)(batch.batch)
-app.command(epilog=finished.EXAMPLES["refine"])(finished.refine)
-app.command(epilog=cameras.EXAMPLES)(cameras.cameras)
-app.command(epilog=check.EXAMPLES)(check.check)
-for command in (finished.render, finished.export, finished.locate, finished.view):
-    app.command(epilog=finished.EXAMPLES[command.__name__])(command)
-app.command(epilog=warmup.EXAMPLES)(warmup.warmup)
+EXAMPLES = {"run": run.EXAMPLES, "batch": batch.EXAMPLES, **finished.EXAMPLES, **input.EXAMPLES}
+for command in (
+    *(run.run, batch.batch, finished.refine, input.cameras, input.check),
+    *(finished.render, finished.export, finished.locate, finished.view, input.warmup),
+):
+    app.command(epilog=EXAMPLES[command.__name__])(command)
 
 
 if __name__ == "__main__":

@@ -39,7 +39,7 @@ def batch(
     ],
     engine: Annotated[
         Where, typer.Option(help="`local`: processes on this machine; `ray`: a Ray cluster (extra `cluster`)")
-    ] = Where.local,
+    ] = "local",
     address: Address = None,
     jobs: Annotated[
         int | None, typer.Option("--jobs", min=1, help="`local`: scenes at a time; empty: as many as the cores allow")
@@ -87,7 +87,7 @@ def batch(
         if store is not None:
             named = with_store(named, store)
         shares = Shares(cpus, gpus, None if memory is None else int(memory * GIGABYTE), attempts)
-        with open_pool(engine.value, output / LOGS, address, jobs) as pool:
+        with open_pool(engine, output / LOGS, address, jobs) as pool:
             results = run_batch(named, pool, output, shares, progress_console(quiet))
         done = sum(result.state.is_done for result in results)
         result.code = 0 if done == len(results) else UNFINISHED

@@ -5,15 +5,13 @@ Imports are made in the commands, so that `--help` does not wait for Taichi and 
 
 from __future__ import annotations
 
-from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from modp_ti.commands.shared import (
     AsJson,
-    Device,
     OnDevice,
     Quiet,
     examples,
@@ -26,6 +24,8 @@ from modp_ti.files.errors import InputError
 
 if TYPE_CHECKING:
     from modp_ti.outputs.locating.locator import Location
+    from modp_ti.outputs.playback.finished_run import FinishedRun
+    from modp_ti.outputs.progress import ProgressLine
 
 EXAMPLES = {
     "render": examples(
@@ -52,21 +52,31 @@ EXAMPLES = {
     ),
     "refine": examples("modp-ti refine out/room", "modp-ti refine out/street --steps 5000"),
 }
-
-
-# The same names as in modp_ti.outputs.playback.film, whose import would load Taichi.
+# The same names as in modp_ti.outputs.playback.film and export_map, whose imports would load Taichi.
 PATH_NAMES = ("recorded", "smoothed", "orbit")
+# fmt: off
+Format = Literal[
+    "points", "mesh", "splat", "spz", "sog", "sog-lod", "compressed-ply", "splat-glb", "html", "colmap", "nerfstudio",
+    "video",
+]
+# fmt: on
+NOT_FOUND = 1
+
+Out = Annotated[Path, typer.Argument(metavar="OUT", help="output folder of a finished run")]
 
 
-class Shown(str, Enum):
-    """Content of the rendered images."""
+def _opened(out: Path, quiet: bool) -> tuple[FinishedRun, ProgressLine]:
+    """Read a finished run, and return it with the line that shows the progress."""
+    from modp_ti.outputs.playback.finished_run import open_run
+    from modp_ti.outputs.progress import ProgressLine
 
-    colour = "colour"
-    depth = "depth"
+    line = ProgressLine(progress_console(quiet))
+    with line.working("reading the run"):
+        return open_run(out), line
 
 
 def render(
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="output folder of a finished run")],
+    out: Out,
     output: Annotated[
         Path | None,
         typer.Option(
@@ -85,7 +95,9 @@ def render(
             autocompletion=lambda incomplete: [name for name in PATH_NAMES if name.startswith(incomplete)],
         ),
     ] = "recorded",
-    show: Annotated[Shown, typer.Option(help="in a folder, depth is float32 TIFF in scene units")] = Shown.colour,
+    show: Annotated[
+        Literal["colour", "depth"], typer.Option(help="in a folder, depth is float32 TIFF in scene units")
+    ] = "colour",
     size: Annotated[str | None, typer.Option(metavar="WIDTHxHEIGHT", help="of the pictures; empty: as mapped")] = None,
     fov: Annotated[
         float | None, typer.Option(min=1, max=150, help="horizontal field of view in degrees; empty: as recorded")
@@ -103,50 +115,27 @@ def render(
     exposure: Annotated[
         bool, typer.Option("--exposure", help="of the recorded path: each picture as exposed as its frame was")
     ] = False,
-    device: OnDevice = Device.auto,
+    device: OnDevice = "auto",
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> None:
     """Render a finished map along the recorded path, a smoothed one, an orbit, or any path of your own."""
     with outcome(as_json) as result:
         from modp_ti.outputs.playback.film import film, is_video, plan_flight
-        from modp_ti.outputs.playback.finished_run import open_run
-        from modp_ti.outputs.progress import ProgressLine
 
-        line = ProgressLine(progress_console(quiet))
-        with line.working("reading the run"):
-            run = open_run(out)
-        depth = show is Shown.depth
-        target = output or run.folder / f"{Path(path).stem}{'-depth' if depth else ''}.mp4"
+        run, line = _opened(out, quiet)
+        target = output or run.folder / f"{Path(path).stem}{'-depth' if show == 'depth' else ''}.mp4"
         if fps is not None and not is_video(target):
             raise InputError(f"--fps: is for videos, and {target} is a folder of pictures: leave it out")
-        flight = plan_flight(
-            run, path, picture_size(size) if size is not None else None, fov, frames, fps, smooth, exposure
-        )
-        film(run, flight, target, depth, device.value, line)
+        pixels = None if size is None else picture_size(size)
+        flight = plan_flight(run, path, pixels, fov, frames, fps, smooth, exposure)
+        film(run, flight, target, show == "depth", device, line)
         result.text = f"written to {target}"
         result.data = {"output": str(target.absolute()), "pictures": len(flight.poses)}
 
 
-class Format(str, Enum):
-    """Export formats."""
-
-    points = "points"
-    mesh = "mesh"
-    splat = "splat"
-    spz = "spz"
-    sog = "sog"
-    sog_lod = "sog-lod"
-    compressed_ply = "compressed-ply"
-    splat_glb = "splat-glb"
-    html = "html"
-    colmap = "colmap"
-    nerfstudio = "nerfstudio"
-    video = "video"
-
-
 def export(
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="output folder of a finished run")],
+    out: Out,
     format: Annotated[
         Format,
         typer.Option(
@@ -171,24 +160,20 @@ def export(
     spz_version: Annotated[
         int | None, typer.Option(min=2, max=4, help="`spz`: version of the format, 2 to 4; empty: 3")
     ] = None,
-    device: OnDevice = Device.auto,
+    device: OnDevice = "auto",
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> None:
     """Write a finished map as web page, points, mesh, compressed splats, data set or video."""
     with outcome(as_json) as result:
         from modp_ti.outputs.playback.export_map import ExportOptions, export_map
-        from modp_ti.outputs.playback.finished_run import open_run
-        from modp_ti.outputs.progress import ProgressLine
 
-        options = ExportOptions(voxel, texture, device.value, spz_version)
-        options.require_used(format.value)
-        line = ProgressLine(progress_console(quiet))
-        with line.working("reading the run"):
-            run = open_run(out)
-        target = export_map(run, format.value, output, options, line)
+        options = ExportOptions(voxel, texture, device, spz_version)
+        options.require_used(format)
+        run, line = _opened(out, quiet)
+        target = export_map(run, format, output, options, line)
         result.text = f"written to {target}"
-        result.data = {"output": str(target.absolute()), "format": format.value}
+        result.data = {"output": str(target.absolute()), "format": format}
 
 
 def view(
@@ -200,7 +185,7 @@ def view(
     ] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="port, or the next one that is free; 0 for any")] = 8080,
     max_splats: Annotated[int, typer.Option(min=100, help="splats that a browser draws, of larger maps")] = 300_000,
-    device: OnDevice = Device.auto,
+    device: OnDevice = "auto",
     quiet: Quiet = False,
 ) -> None:
     """Show a finished map, or a .ply file of splats, as a web page, until Ctrl-C."""
@@ -213,7 +198,7 @@ def view(
         run = open_splats(out.expanduser()) if out.expanduser().is_file() else open_run(out)
         settings = ViewSettings(enabled=True, host=host, port=port, max_splats=max_splats)
         with ProgressLine(progress_console(quiet)).working("reading the map"):
-            viewer = FinishedViewer(run, settings, device.value)
+            viewer = FinishedViewer(run, settings, device)
         typer.echo(f"viewer: {viewer.page.address}\nCtrl-C ends it")
         try:
             viewer.serve()
@@ -223,11 +208,8 @@ def view(
             viewer.close()
 
 
-NOT_FOUND = 1
-
-
 def locate(
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="output folder of a finished run")],
+    out: Out,
     pictures: Annotated[list[Path], typer.Argument(metavar="PICTURE", help="image files")],
     camera: Annotated[
         str | None,
@@ -237,7 +219,7 @@ def locate(
             "run's camera if the shape of a picture is that of the run's images, else its focal length is estimated",
         ),
     ] = None,
-    device: OnDevice = Device.auto,
+    device: OnDevice = "auto",
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> None:
@@ -253,12 +235,10 @@ def locate(
         console = progress_console(quiet)
         line = ProgressLine(console)
         given = None if camera is None else given_camera(camera)
-        for picture in pictures:
+        for picture in pictures:  # before the map is loaded, which takes seconds
             if not picture.is_file():
-                raise InputError(
-                    f"{picture}: {'is a folder' if picture.is_dir() else 'no such picture'}; name image files"
-                )
-        locator = Locator(out, device.value, console)
+                raise InputError(f"{picture}: {'is a folder' if picture.is_dir() else 'no such file'}; name images")
+        locator = Locator(out, device, console)
         found = [locator.locate(picture, given) for picture in line.through("locating", pictures, len(pictures))]
         for note in dict.fromkeys(location.note for location in found):
             line.note(f"note: {note}")
@@ -306,15 +286,9 @@ def refine(
         from modp_ti.engine.refined_run import refine_run
 
         metrics = refine_run(out, steps, progress_console(quiet))
-        result.text = _refined(out, metrics)
+        which = "held_out" if metrics["refined"]["held_out"]["count"] else "all"
+        before, after = (stage[which]["psnr"] for stage in (metrics["refinement"]["before"], metrics["refined"]))
+        result.text = f"written to {out}"
+        if before is not None and after is not None:
+            result.text += f"; {which.replace('_', '-')} PSNR {before:.2f} dB before, {after:.2f} dB after"
         result.data = {"output": str(out.absolute()), "metrics": metrics}
-
-
-def _refined(out: Path, metrics: dict) -> str:
-    """Return the result in one line."""
-    which = "held_out" if metrics["refined"]["held_out"]["count"] else "all"
-    before, after = (stage[which]["psnr"] for stage in (metrics["refinement"]["before"], metrics["refined"]))
-    scores = ""
-    if before is not None and after is not None:
-        scores = f"; {which.replace('_', '-')} PSNR {before:.2f} dB before, {after:.2f} dB after"
-    return f"written to {out}{scores}"

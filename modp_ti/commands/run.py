@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -22,6 +22,12 @@ from modp_ti.commands.shared import (
     progress_console,
 )
 from modp_ti.files.errors import InputError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from modp_ti.config.settings import SceneConfig
+    from modp_ti.engine.snapshot import Snapshot
 
 EXAMPLES = examples(
     "modp-ti run scene.yaml",
@@ -104,6 +110,8 @@ def run(
     with outcome(as_json) as result:
         if scene is not None and any("=" not in word for word in more or []):
             raise InputError("one recording at a time: `modp-ti batch` maps several; of pictures, name their folder")
+        if len(sources) > 1 and (stream is not None or replay is not None):
+            raise InputError("--stream and --replay need no scene file and no --resume: give one of them")
         settled = {"--onto": onto, "--parts": parts} | ({} if scene else {"--fast": fast, "--best": best})
         for option, value in settled.items():
             if value and (resume is not None or replay is not None):
@@ -113,76 +121,79 @@ def run(
             overrides.append(f"onto={json.dumps(str(onto.expanduser().resolve()), ensure_ascii=False)}")
         if parts is not None:
             overrides.append(f"parts={parts}")
-        preset = chosen_preset(fast, best)
-        if len(sources) > 1 and (stream is not None or replay is not None):
-            raise InputError("--stream and --replay need no scene file and no --resume: give one of them")
+        preset, console = chosen_preset(fast, best), progress_console(quiet)
         if task:
             from modp_ti.many.task import carry_out
 
-            folder = carry_out(progress_console(quiet))
+            folder = carry_out(console)
         elif replay is not None:
-            folder = _replay(replay, overrides, quiet)
+            folder = _replay(replay, overrides, console)
         else:
-            tasks = None if engine is None and address is None else (engine or Where.local, address)
-            folder = _run(scene, stream, resume, overrides, preset, quiet, tasks)
+            config, snapshot = _settings(scene, stream, resume, overrides, preset, console)
+            folder = _map(config, snapshot, engine, address, console)
+            if resume is not None:
+                from modp_ti.engine.resume import discard
+
+                discard(folder)
         result.text = f"written to {folder}"
         if as_json:
             metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
             result.data = {"output": str(folder), "metrics": metrics}
 
 
-def _run(
+def _settings(
     scene: Path | None,
     stream: str | None,
     resume: Path | None,
     overrides: list[str],
     preset: str | None,
-    quiet: bool,
-    tasks: tuple[Where, str | None] | None,
-) -> Path:
+    console: Console,
+) -> tuple[SceneConfig, Snapshot | None]:
+    """Return the settings of a run, and the snapshot that it resumes from, if any."""
     # Imported here, so that `--help` does not wait for Taichi and the readers to load.
     from modp_ti.files.run_folder import require_usable
     from modp_ti.inputs.bare_recording import base_of, is_recording, named_scene, streamed_scene
     from modp_ti.inputs.scene_paths import refuse_output_in_input
     from modp_ti.outputs.progress import ProgressLine
 
-    snapshot = None
     if resume is not None:
         from modp_ti.engine.resume import load_resumed
 
         if scene is not None and is_recording(scene):
             raise InputError(f"{scene}: --resume has the recording already; leave it out")
-        config, snapshot = load_resumed(resume, scene, overrides, preset)
+        return load_resumed(resume, scene, overrides, preset)
+    if stream is not None:
+        config = streamed_scene(stream, overrides, preset)
     else:
-        if stream is not None:
-            config = streamed_scene(stream, overrides, preset)
-        else:
-            assert scene is not None, "run() asks for one of them"
-            config = named_scene(scene, overrides, preset, say=ProgressLine(progress_console(quiet)).note)
-        refuse_output_in_input(config, Path.cwd() if scene is None else base_of(scene))
-        require_usable(config.output)  # once more in the run: here, before Taichi is loaded
+        assert scene is not None, "run() asks for one of them"
+        config = named_scene(scene, overrides, preset, say=ProgressLine(console).note)
+    refuse_output_in_input(config, Path.cwd() if scene is None else base_of(scene))
+    require_usable(config.output)  # once more in the run: here, before Taichi is loaded
+    return config, None
+
+
+def _map(
+    config: SceneConfig, snapshot: Snapshot | None, engine: Where | None, address: str | None, console: Console
+) -> Path:
+    """Map in this process, or in parts. Returns the output folder."""
     if config.parts is not None:
         from modp_ti.many.parts import map_in_parts
 
-        return map_in_parts(config, *(tasks or (Where.local, None)), progress_console(quiet))
-    if tasks is not None:
+        return map_in_parts(config, engine or "local", address, console)
+    if engine is not None or address is not None:
         raise InputError("--engine and --address are for --parts, whose tasks they carry out")
-    from modp_ti.engine.resume import discard
     from modp_ti.engine.session import run_scene
 
-    folder = run_scene(config, progress_console(quiet), snapshot)
-    if resume is not None:
-        discard(folder)
-    return folder
+    return run_scene(config, console, snapshot)
 
 
-def _replay(recorded: Path, overrides: list[str], quiet: bool) -> Path:
-    """Repeat a recorded session. Its output goes to a folder beside that of the recorded run, unless it is set."""
+def _replay(recorded: Path, overrides: list[str], console: Console) -> Path:
+    """Repeat a recorded session. Its output goes to a folder next to that of the recorded run, unless it is set."""
     from modp_ti.config.scene_file import scene_from_data
     from modp_ti.engine.recording import RecordedSession
     from modp_ti.engine.session import run_scene
 
     session = RecordedSession(recorded)
-    beside = recorded.resolve().with_name(f"{recorded.resolve().name}-replayed")
-    settings = {**session.settings, "output": str(beside)}
-    return run_scene(scene_from_data(settings, str(recorded), overrides), progress_console(quiet), replayed=session)
+    target = recorded.resolve().with_name(f"{recorded.resolve().name}-replayed")
+    settings = {**session.settings, "output": str(target)}
+    return run_scene(scene_from_data(settings, str(recorded), overrides), console, replayed=session)

@@ -11,8 +11,7 @@ import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, redirect_stdout, suppress
 from dataclasses import dataclass, field
-from enum import Enum
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
 import typer
 from typer.core import TyperCommand, TyperGroup
@@ -40,21 +39,8 @@ USAGE_ERROR: Any = typer.BadParameter.__mro__[1]
 MAX_MESSAGE = 1000
 
 
-class Device(str, Enum):
-    """The device to compute on."""
-
-    auto = "auto"
-    cpu = "cpu"
-    cuda = "cuda"
-    vulkan = "vulkan"
-    metal = "metal"
-
-
-class Where(str, Enum):
-    """The engines of tasks."""
-
-    local = "local"
-    ray = "ray"
+Device = Literal["auto", "cpu", "cuda", "vulkan", "metal"]
+Where = Literal["local", "ray"]
 
 
 def matching_settings(incomplete: str) -> list[tuple[str, str]]:
@@ -216,7 +202,7 @@ def examples(*lines: str) -> str:
 
 
 class Command(TyperCommand):
-    """A command whose wrong options are said as any other wrong input is: in one line, and in JSON with `--json`."""
+    """A command that reports wrong options as any other wrong input: in one line, and in JSON with `--json`."""
 
     def main(self, *args: Any, **settings: Any) -> Any:
         _parsed(super().main, *args, **settings)

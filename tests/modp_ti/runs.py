@@ -35,16 +35,16 @@ refine:  {steps: 20}
 
 def run(scene: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     """A run on a machine whose torch has no weights in its cache."""
-    return _called("modp_ti.run", scene, *arguments)
+    return _called(scene, "modp_ti.run", str(scene), *arguments)
 
 
 def check(scene: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     """The same of `modp-ti check`."""
-    return _called("modp_ti.commands.check", scene, *arguments)
+    return _called(scene, "modp_ti.commands.app", "check", str(scene), *arguments)
 
 
-def _called(module: str, scene: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", module, str(scene), *arguments]
+def _called(scene: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", *arguments]
     environment = {**os.environ, "TORCH_HOME": str(scene.parent / "no-torch")}
     return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False, env=environment)
 

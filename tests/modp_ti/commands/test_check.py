@@ -52,6 +52,25 @@ def planted(model: Path, target: Path, pose: Callable = lambda T: T, intrinsics:
     result.write_binary(str(target))
 
 
+def turning(seed: int, angle: float, shift: float = 0.0) -> Callable[[np.ndarray], np.ndarray]:
+    """Poses that have nothing to do with those that were."""
+    rng = np.random.default_rng(seed)
+
+    def turned(T: np.ndarray) -> np.ndarray:
+        by = np.eye(4)
+        by[:3, :3] = cv2.Rodrigues(rng.normal(0, angle, 3))[0]
+        by[:3, 3] = rng.normal(0, 1, 3) * shift
+        return by @ T
+
+    return turned
+
+
+@pytest.fixture
+def model(plane_scene) -> Path:
+    """The COLMAP model of the photographs of a plane, with points on it."""
+    return plane_scene.write_colmap(np.c_[np.random.default_rng(2).uniform(-1.8, 1.8, (300, 2)), np.zeros(300)])
+
+
 FAULTS = {
     "as_stated": ({}, None),
     "inverse_poses": ({"pose": np.linalg.inv}, "the poses are inverted"),
@@ -85,9 +104,7 @@ def assert_named(fault: str, code: int, data: dict) -> None:
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_planted_fault_is_named(fault: str, plane_scene, tmp_path: Path) -> None:
-    rng = np.random.default_rng(2)
-    model = plane_scene.write_colmap(np.c_[rng.uniform(-1.8, 1.8, (300, 2)), np.zeros(300)])
+def test_a_planted_fault_is_named(fault: str, plane_scene, model: Path, tmp_path: Path) -> None:
     planted(model, tmp_path / "fault", **FAULTS[fault][0])
     assert_named(fault, *checked(scene_file(tmp_path, plane_scene.folder, tmp_path / "fault")))
 
@@ -100,33 +117,13 @@ def test_a_planted_fault_is_named_on_desk(fault: str, shared_data, tmp_path: Pat
     assert_named(fault, *checked(file))
 
 
-def test_poses_of_another_recording_fit_under_no_convention(plane_scene, tmp_path: Path) -> None:
-    rng = np.random.default_rng(2)
-    model = plane_scene.write_colmap(np.c_[rng.uniform(-1.8, 1.8, (300, 2)), np.zeros(300)])
-    other = np.random.default_rng(5)
-
-    def elsewhere(T: np.ndarray) -> np.ndarray:
-        turned = np.eye(4)
-        turned[:3, :3] = cv2.Rodrigues(other.normal(0, 0.3, 3))[0]
-        turned[:3, 3] = T[:3, 3] + other.normal(0, 0.5, 3)
-        return turned
-
-    planted(model, tmp_path / "fault", elsewhere)
-    code, data = checked(scene_file(tmp_path, plane_scene.folder, tmp_path / "fault"))
+def test_poses_of_another_recording_are_refused_by_check_and_by_a_run_unless_it_is_forced(
+    plane_scene, model: Path, tmp_path: Path
+) -> None:
+    planted(model, tmp_path / "elsewhere", turning(5, 0.3, 0.5))
+    code, data = checked(scene_file(tmp_path, plane_scene.folder, tmp_path / "elsewhere"))
     assert (code, codes(data)["poses_do_not_fit"]) == (2, "unusable")
-
-
-def test_a_run_refuses_poses_of_another_recording_unless_it_is_forced(plane_scene, tmp_path: Path) -> None:
-    rng = np.random.default_rng(2)
-    model = plane_scene.write_colmap(np.c_[rng.uniform(-1.8, 1.8, (300, 2)), np.zeros(300)])
-    other = np.random.default_rng(5)
-
-    def turned(T: np.ndarray) -> np.ndarray:
-        by = np.eye(4)
-        by[:3, :3] = cv2.Rodrigues(other.normal(0, 0.1, 3))[0]
-        return by @ T
-
-    planted(model, tmp_path / "fault", turned)
+    planted(model, tmp_path / "fault", turning(5, 0.1))
     scene = scene_file(tmp_path, plane_scene.folder, tmp_path / "fault", scale=0.25)
     few = ["--set", "refine.steps=0", "--set", "mapping.optimise.steps=1", "--set", "device=cpu", "--json"]
     refused = CliRunner().invoke(app, ["run", str(scene), *few])
@@ -135,8 +132,9 @@ def test_a_run_refuses_poses_of_another_recording_unless_it_is_forced(plane_scen
 
 
 @pytest.mark.parametrize("command", ["check", "run"])
-def test_a_recording_of_held_out_frames_alone_is_unusable(command: str, plane_scene, tmp_path: Path) -> None:
-    model = plane_scene.write_colmap(np.c_[np.random.default_rng(2).uniform(-1.8, 1.8, (300, 2)), np.zeros(300)])
+def test_a_recording_of_held_out_frames_alone_is_unusable(
+    command: str, plane_scene, model: Path, tmp_path: Path
+) -> None:
     scene = scene_file(tmp_path, plane_scene.folder, model, stop=1, holdout=8)
     assert CliRunner().invoke(app, [command, str(scene), "--set", "device=cpu"]).exit_code == 2
 
@@ -151,9 +149,7 @@ def test_checking_a_reconstruction_leaves_nothing_behind(plane_scene, tmp_path: 
     ]
 
 
-def test_points_of_another_world_are_told_from_wrong_poses(plane_scene, tmp_path: Path) -> None:
-    rng = np.random.default_rng(2)
-    model = plane_scene.write_colmap(np.c_[rng.uniform(-1.8, 1.8, (300, 2)), np.zeros(300)])
+def test_points_of_another_world_are_told_from_wrong_poses(plane_scene, model: Path, tmp_path: Path) -> None:
     damaged = pycolmap.Reconstruction(str(model))
     for point in damaged.points3D.values():
         point.xyz = 0.5 * point.xyz
@@ -162,10 +158,8 @@ def test_points_of_another_world_are_told_from_wrong_poses(plane_scene, tmp_path
     assert (code, codes(data)["points_do_not_fit"]) == (1, "warning")
 
 
-def test_blurred_repeated_and_missing_frames_are_named(plane_scene, tmp_path: Path) -> None:
-    rng = np.random.default_rng(2)
-    model = plane_scene.write_colmap(np.c_[rng.uniform(-1.8, 1.8, (300, 2)), np.zeros(300)])
-    images = {}
+def test_blurred_repeated_and_missing_frames_are_named(plane_scene, model: Path, tmp_path: Path) -> None:
+    images, rng = {}, np.random.default_rng(3)
     for name in plane_scene.names:  # with the fine grain that photographs have
         smooth = cv2.imread(str(plane_scene.folder / name))
         images[name] = np.clip(smooth + rng.normal(0, 12, smooth.shape), 0, 255).astype(np.uint8)
@@ -183,9 +177,7 @@ def test_blurred_repeated_and_missing_frames_are_named(plane_scene, tmp_path: Pa
     assert code >= 1
 
 
-def test_the_figures_are_those_of_the_input(plane_scene, tmp_path: Path) -> None:
-    rng = np.random.default_rng(2)
-    model = plane_scene.write_colmap(np.c_[rng.uniform(-1.8, 1.8, (300, 2)), np.zeros(300)])
+def test_the_figures_are_those_of_the_input(plane_scene, model: Path, tmp_path: Path) -> None:
     code, data = checked(scene_file(tmp_path, plane_scene.folder, model, scale=0.5, holdout=3))
     assert (code, data["verdict"]) == (0, "fine")
     assert (data["frames"], data["held_out"], data["size"], data["cameras"]) == (7, 3, [160, 120], 1)
@@ -228,9 +220,7 @@ def test_frames_that_come_through_a_socket_are_checked_as_they_arrive(plane_scen
     assert codes(data) == {"inverse_poses": "unusable", "points": "unusable"}
 
 
-def test_a_person_reads_a_table_a_mend_and_a_verdict(plane_scene, tmp_path: Path) -> None:
-    rng = np.random.default_rng(2)
-    model = plane_scene.write_colmap(np.c_[rng.uniform(-1.8, 1.8, (300, 2)), np.zeros(300)])
+def test_a_person_reads_a_table_a_mend_and_a_verdict(plane_scene, model: Path, tmp_path: Path) -> None:
     planted(model, tmp_path / "fault", np.linalg.inv)
     result = CliRunner().invoke(app, ["check", str(scene_file(tmp_path, plane_scene.folder, tmp_path / "fault"))])
     lines = result.stdout.splitlines()

@@ -140,11 +140,6 @@ def test_a_faulty_file_of_each_kind_of_source_gets_one_line(scene, session, tmp_
     refused("run", scene, names="view12.png")
 
 
-def test_a_message_of_several_lines_is_put_on_one(scene, session):
-    session.failing = InputError("first\n  second")
-    refused("run", scene, names="first second")
-
-
 def python(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, *arguments]
     there = os.environ | environment
@@ -182,6 +177,8 @@ def test_errors_are_said_to_people_and_to_programs_whatever_else_is_not(tmp_path
 
 
 def test_a_fault_of_the_program_has_a_traceback_and_its_own_code(scene, session):
+    session.failing = InputError("first\n  second")
+    refused("run", scene, names="first second")
     session.failing = ZeroDivisionError("of all things")
     result = invoke("run", scene, "--json")
     assert (result.exit_code, json.loads(result.stdout)["exit_code"]) == (3, 3)
@@ -274,30 +271,35 @@ def test_version():
     assert (result.exit_code, result.stdout) == (0, f"modp-ti {modp_ti.__version__} ({engine()})\n")
 
 
-@pytest.mark.parametrize(
-    ("line", "offered"),
-    [
-        ("modp-ti ", COMMANDS),
-        ("modp-ti run scene.yaml --q", ["--quiet"]),
-        ("modp-ti export out --format sp", ["splat", "spz", "splat-glb"]),
-        ("modp-ti render out --path ", ["recorded", "smoothed", "orbit"]),
-        ("modp-ti run scene.yaml --set source.sc", ["source.scale=auto"]),
-        ("modp-ti run scene.yaml --set tracker.kind=tu", ["tracker.kind=tum"]),
-    ],
-)
-def test_the_shell_is_offered_commands_options_and_values_without_waiting(line, offered):
+COMPLETED = {
+    "modp-ti ": COMMANDS,
+    "modp-ti run scene.yaml --q": ["--quiet"],
+    "modp-ti export out --format sp": ["splat", "spz", "splat-glb"],
+    "modp-ti render out --path ": ["recorded", "smoothed", "orbit"],
+    "modp-ti run scene.yaml --set source.sc": ["source.scale=auto"],
+    "modp-ti run scene.yaml --set tracker.kind=tu": ["tracker.kind=tum"],
+}
+
+
+def test_the_shell_is_offered_commands_options_and_values_without_waiting():
+    """In one process, which loads nothing heavy."""
     heavy = "('taichi', 'quadrants', 'torch', 'open3d', 'pycolmap', 'matplotlib')"
+    lines = [line.split(" ") for line in COMPLETED]
     code = (
-        "import sys; sys.argv[0] = 'modp-ti'\n"
+        "import contextlib, io, json, os, sys; sys.argv[0] = 'modp-ti'\n"
         "from modp_ti.commands.app import app\n"
-        f"try: app()\nfinally: print([name for name in {heavy} if name in sys.modules], file=sys.stderr)"
+        "def told(**given):\n"
+        "    os.environ.update(given); out = io.StringIO()\n"
+        "    with contextlib.redirect_stdout(out), contextlib.suppress(SystemExit): app()\n"
+        "    return out.getvalue()\n"
+        "complete = dict(_MODP_TI_COMPLETE='complete_bash')\n"
+        f"offered = [told(COMP_WORDS='\\n'.join(w), COMP_CWORD=str(len(w) - 1), **complete) for w in {lines}]\n"
+        f"print(json.dumps([[name for name in {heavy} if name in sys.modules], offered, "
+        "told(_MODP_TI_COMPLETE='source_bash')]))"
     )
-    words = line.split(" ")
-    there = {"COMP_WORDS": "\n".join(words), "COMP_CWORD": str(len(words) - 1)}
-    done = python("-c", code, _MODP_TI_COMPLETE="complete_bash", **there)
-    assert (done.stdout.split(), done.stderr.strip()) == (offered, "[]")
-    done = python("-c", code, _MODP_TI_COMPLETE="source_bash")
-    assert "complete -o default -F _modp_ti_completion modp-ti" in done.stdout
+    loaded, offered, script = json.loads(python("-c", code, _MODP_TI_COMPLETE="complete_bash").stdout)
+    assert loaded == [] and [text.split() for text in offered] == list(COMPLETED.values())
+    assert "complete -o default -F _modp_ti_completion modp-ti" in script
 
 
 def test_every_setting_that_is_offered_is_one_that_the_scene_takes(scene):

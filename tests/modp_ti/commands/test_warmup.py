@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from fields.runtime.engine import engine
 from modp_ti.commands import app as cli
-from modp_ti.engine import mapper
+from modp_ti.engine import mapper, stages
 from tests.patience import PATIENCE
 
 SCENE = """
@@ -40,7 +40,7 @@ def test_bad_input_gets_one_line_and_exit_code_two(call: str, named: str) -> Non
 @pytest.mark.parametrize(
     ("arguments", "size"),
     [
-        (["live.yaml"], (640, 640)),
+        (["live.yaml"], (stages.EXPECTED.width, stages.EXPECTED.height)),
         (["live.yaml", "--size", "320x240"], (640, 640)),
         (["live.yaml", "--size", "960x540"], (960, 540)),
         (["--size", "320x240"], (320, 240)),
@@ -73,7 +73,7 @@ def test_a_run_after_the_warm_up_compiles_nothing(plane_scene, tmp_path) -> None
         assert done.returncode == 0, done.stderr
         return {file.name for file in cache.rglob("*") if file.suffix == engine().cache_suffix}, done.stdout
 
-    compiled, said = kernels_after("modp_ti.commands.warmup", str(scene))
+    compiled, said = kernels_after("modp_ti.commands.app", "warmup", str(scene))
     assert len(compiled) > 30
     assert re.search(r"^320x240 on cpu: [0-9.]+ s$", said, re.MULTILINE)
     assert kernels_after("modp_ti.commands.app", "run", str(scene))[0] == compiled

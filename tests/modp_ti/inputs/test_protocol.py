@@ -9,7 +9,7 @@ import pytest
 
 from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.camera import PinholeCamera
-from modp_ti.commands.check import _lens
+from modp_ti.commands.input import _lens
 from modp_ti.inputs.delivered_frames import settled
 from modp_ti.inputs.protocol import Tracker
 from modp_ti.inputs.sources import Picture
