@@ -112,7 +112,7 @@ def restore_state(mapper: OnlineMapper, state: MapState, frames: Iterable[Tracke
             from them.
 
     Raises:
-        KeyError, TypeError, ValueError: If the state does not fit. The map is then unusable.
+        KeyError, ValueError: If the state is of another map, or not complete. The map is then unusable.
     """
     for group, table in _tables(mapper).items():
         table.restore(state.group(group))
@@ -142,16 +142,12 @@ def restore_state(mapper: OnlineMapper, state: MapState, frames: Iterable[Tracke
     anchors = state.group("anchors")
     pairs = zip(anchors["keyframe"].tolist(), anchors["spacing"].tolist(), strict=True)
     mapper.densifier.anchors = [Anchor(mapper.keyframes[row], spacing) for row, spacing in pairs]
-    if len(mapper.gaussians) and mapper.gaussians.anchors().max() >= len(mapper.densifier.anchors):
-        raise ValueError("a Gaussian has an anchor that the state does not contain")
     if mapper.densifier.voxels is not None:
         coarsest, origin = state.numbers["coarsest"], np.array(state.numbers["origin"])
         mapper.densifier.voxels.settle(coarsest, origin)
         mapper.densifier.voxels.restore(**state.group("voxels"))
     previous = state.group("previous")
     mapper.selector.previous = int(previous["index"]) if previous else None
-    if previous and mapper.selector.previous not in mapper.trajectory:
-        raise ValueError(f"frame {mapper.selector.previous} has no tracked pose")
     mapper.frame_count = int(state.numbers["frames"])
     mapper.settled = int(state.numbers["settled"])
     mapper.hidden.due = int(state.numbers["sweep_due"])

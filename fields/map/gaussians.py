@@ -238,13 +238,9 @@ class GaussianField:
         return moments | {"steps": self._numbers(self.steps, first, np.int32), "anchor": self.anchors(first)}
 
     def restore(self, state: dict[str, NDArray]) -> None:
-        """Replace all Gaussians by saved values and optimiser state. Arguments and errors are those of `extend`."""
-        before, self.count = self.count, 0
-        try:
-            self.extend(state)
-        except (KeyError, ValueError):
-            self.count = before
-            raise
+        """Replace all Gaussians by saved values and optimiser state, see `extend`."""
+        self.count = 0
+        self.extend(state)
 
     def extend(self, state: dict[str, NDArray]) -> None:
         """Add saved Gaussians with their optimiser state.
@@ -254,14 +250,8 @@ class GaussianField:
 
         Raises:
             KeyError: If an entry is missing.
-            ValueError: As in `append`, and if a moment is not finite or its shape differs from that of its value.
+            ValueError: As in `append`.
         """
-        for name in (name + end for end in MOMENTS for name in _NAMES):
-            if state[name].shape != state[name[:-2]].shape or not np.isfinite(state[name]).all():
-                raise ValueError(f"{name} must be finite and {state[name[:-2]].shape}, not {state[name].shape}")
-        for name in ("steps", "anchor"):
-            if state[name].shape != state["opacity_logit"].shape:
-                raise ValueError(f"{name} has shape {state[name].shape}, expected {state['opacity_logit'].shape}")
         first = self.count
         self.append(*(state[name] for name in _NAMES))
         if self.count == first:

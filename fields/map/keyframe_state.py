@@ -65,31 +65,14 @@ class KeyframeRows:
 
     Attributes:
         rows: Row of each keyframe, by frame index.
-
-    Raises:
-        KeyError: If an array is missing.
-        ValueError: If an array has another shape, or a value that must be finite is not.
     """
 
     def __init__(self, arrays: Mapping[str, NDArray]) -> None:
-        count = len(arrays["index"])
-        for name, shape in {**NUMBERS, "exposure": (3, 4), "is_between": ()}.items():
-            if arrays[name].shape != (count, *shape):
-                raise ValueError(f"{name} has shape {arrays[name].shape}, expected {(count, *shape)}")
-            if name != "exposure" and not np.isfinite(arrays[name]).all():
-                raise ValueError(f"{name} is not finite")
-        total = int(arrays["points"].sum())
-        if arrays["points"].shape != (count,) or (arrays["points"] < 0).any() or len(arrays["ids"]) != total:
-            raise ValueError(f"{len(arrays['ids'])} tracked points, {total} are announced")
-        self._masks = arrays.get("transient", NO_MASK.ravel())
-        self._mask_size = arrays.get("transient_size", np.zeros((count, 2), dtype=np.int64))
-        areas = self._mask_size.prod(axis=-1)
-        if self._mask_size.shape != (count, 2) or (self._mask_size < 0).any() or areas.sum() != len(self._masks):
-            raise ValueError(f"{len(self._masks)} pixels of masks of what moves, {areas.sum()} are announced")
-        self._first_mask = np.concatenate([[0], np.cumsum(areas)])
-        self._arrays = arrays
-        self._first = np.concatenate([[0], np.cumsum(arrays["points"])])
         self.rows = {int(index): row for row, index in enumerate(arrays["index"])}
+        self._arrays = arrays
+        self._first = np.append(0, np.cumsum(arrays["points"]))
+        self._mask_size = arrays.get("transient_size", np.zeros((len(self.rows), 2), dtype=np.int64))
+        self._masks = np.split(arrays.get("transient", NO_MASK.ravel()), np.cumsum(self._mask_size.prod(axis=1))[:-1])
 
     def put(self, frame: TrackedFrame, store: KeyframeStore) -> None:
         """Restore the next keyframe from its frame.
@@ -111,6 +94,5 @@ class KeyframeRows:
         view.exposure = None if np.isnan(exposure).all() else np.array(exposure)
         own = slice(self._first[row], self._first[row + 1])
         view.points = SparsePoints(*(np.array(self._arrays[name][own]) for name in ("xyz", "pixels", "ids")))
-        mask = self._masks[self._first_mask[row] : self._first_mask[row + 1]].astype(np.uint8)
-        if mask.size:
-            store.mask(view, mask.reshape(self._mask_size[row]))
+        if self._masks[row].size:
+            store.mask(view, self._masks[row].reshape(self._mask_size[row]))

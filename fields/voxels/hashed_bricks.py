@@ -38,26 +38,21 @@ class HashedBricks(Bricks):
 
     @property
     def count(self) -> int:
-        """Number of allocated bricks."""
         return self._count
 
     def clear(self) -> None:
-        """Remove all marks."""
         self._halves.fill(0)
 
     def corners(self) -> NDArray[np.int32]:
-        """Return the corners (B, 3) of the allocated bricks, in any order."""
         return self._corners.to_numpy()[: self._count]
 
     def read(self, corners: NDArray[np.int32]) -> NDArray[np.uint64]:
-        """Return the words (B, 10) of allocated bricks, given by their corners (B, 3)."""
         every = numbered(self.corners())
         order = np.argsort(every)
         halves = self._halves.to_numpy()[order[np.searchsorted(every, numbered(corners), sorter=order)]]
         return halves[:, 0::2] | halves[:, 1::2].astype(np.uint64) << np.uint64(32)
 
     def remove(self, corners: NDArray[np.int32]) -> None:
-        """Deallocate bricks, given by their corners (B, 3). All bricks of a region go together."""
         every = self.corners()
         kept = every[~np.isin(numbered(every), numbered(corners))]
         words = self.read(kept)
@@ -67,19 +62,16 @@ class HashedBricks(Bricks):
         self.write(*places_of_marks(kept, words))
 
     def write(self, places: NDArray[np.int32], words: NDArray[np.uint64]) -> None:
-        """Set words (M,) at their places (M, 4): the brick's corner and the word in the brick."""
         self._add(places[:, :3])
         halves = np.stack([words & np.uint64(0xFFFFFFFF), words >> np.uint64(32)], axis=1).astype(np.uint32)
         _write(self._table, self._corners, self._halves, places, halves)
 
     def query(self, cells: NDArray[np.int32], level: NDArray[np.int32]) -> NDArray[np.bool_]:
-        """Return whether each cell is marked (N,). A cell that no level covers counts as marked."""
         out = np.empty(len(cells), dtype=np.int32)
         _query(self._table, self._corners, self._halves, self.levels, cells, level, out)
         return out.astype(bool)
 
     def mark(self, cells: NDArray[np.int32], level: NDArray[np.int32]) -> None:
-        """Mark each cell, from its level up to the coarsest. All cells lie in the range of some level."""
         self._add(self.corners_to_mark(cells, level))
         _mark(self._table, self._corners, self._halves, self.levels, cells, level)
 

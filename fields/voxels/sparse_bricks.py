@@ -64,15 +64,12 @@ class SparseBricks(Bricks):
 
     @property
     def count(self) -> int:
-        """Number of allocated bricks."""
         return self._count()
 
     def clear(self) -> None:
-        """Remove all marks."""
         self._clear()
 
     def corners(self) -> NDArray[np.int32]:
-        """Return the corners (B, 3) of the allocated bricks, in any order."""
         corners = np.zeros((self.count, 3), dtype=np.int32)
         if len(corners):
             self._next[None] = 0
@@ -80,13 +77,11 @@ class SparseBricks(Bricks):
         return corners
 
     def read(self, corners: NDArray[np.int32]) -> NDArray[np.uint64]:
-        """Return the words (B, 10) of allocated bricks, given by their corners (B, 3)."""
         words = np.zeros((len(corners), WORDS), dtype=np.uint64)
         self._read(corners, words)
         return words
 
     def remove(self, corners: NDArray[np.int32]) -> None:
-        """Deallocate bricks, given by their corners (B, 3). All bricks of a region go together."""
         places = []
         for node in range(len(POINTERS)):
             width = int(np.prod(POINTERS[node + 1 :]))  # of what lies below a pointer of the node [bricks]
@@ -97,19 +92,16 @@ class SparseBricks(Bricks):
         self._deactivate(np.concatenate(places).astype(np.int32))
 
     def write(self, places: NDArray[np.int32], words: NDArray[np.uint64]) -> None:
-        """Set words (M,) at their places (M, 4): the brick's corner and the word in the brick."""
         if on_gpu():
             self._activate(without_repetitions(places[:, :3]))
         self._write(places, words)
 
     def query(self, cells: NDArray[np.int32], level: NDArray[np.int32]) -> NDArray[np.bool_]:
-        """Return whether each cell is marked (N,). A cell that no level covers counts as marked."""
         out = np.empty(len(cells), dtype=np.uint8)
         self._query(cells, level, out)
         return out.astype(bool)
 
     def mark(self, cells: NDArray[np.int32], level: NDArray[np.int32]) -> None:
-        """Mark each cell, from its level up to the coarsest. All cells lie in the range of some level."""
         if on_gpu():
             self._activate(without_repetitions(self.corners_to_mark(cells, level)))
         self._mark(cells, level)

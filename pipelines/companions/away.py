@@ -288,13 +288,11 @@ class BlocksOnDisk:
         """Restore the blocks of `state`. Keyframes, with their images on disk, have been restored before.
 
         Raises:
-            KeyError, ValueError: If the arrays do not fit the map, or blocks are damaged.
+            ValueError: If blocks are damaged.
             OSError: If the blocks cannot be written.
         """
         kind = self.resident_records(len(self.gaussians)).dtype
         viewers = np.split(arrays["viewers"], np.cumsum(arrays["viewer_counts"])[:-1])
-        if len(arrays["viewers"]) and not 0 <= arrays["viewers"].min() <= arrays["viewers"].max() < len(self.keyframes):
-            raise ValueError("a block on disk is seen by a keyframe that the state does not contain")
         files = np.unique(arrays["file"]).tolist()
         paths = {
             file: self._files.take(arrays[f"bytes{file}"], kind, int((arrays["file"] == file).sum())) for file in files

@@ -252,15 +252,7 @@ class Moments:
         }
 
     def restore(self, state: Mapping[str, NDArray]) -> None:
-        """Restore the result of `state`.
-
-        Raises:
-            KeyError: If an array is missing.
-            ValueError: If the arrays do not fit together, or a value is not finite.
-        """
+        """Restore the result of `state`."""
         index = state["index"].tolist()
-        for name in ("m", "v"):
-            if state[name].shape != (len(index), *self._shape) or not np.isfinite(state[name]).all():
-                raise ValueError(f"the moments {name} are {state[name].shape} of {len(index)} keyframes, or not finite")
         self.steps = dict(zip(index, state["steps"].tolist(), strict=True))
         self._first, self._second = (dict(zip(index, np.array(state[name]), strict=True)) for name in ("m", "v"))

@@ -149,17 +149,10 @@ class FrameGate:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Restore the result of `state`. The trajectory must have been restored before.
-
-        Raises:
-            KeyError, TypeError, ValueError: If the state does not fit.
-        """
+        """Restore the result of `state`."""
         self.refused |= {name: int(count) for name, count in state["refused"].items()}
         self._picture = int(state["picture"])
         self._seen, self._accepted = (None if b is None else int(b) for b in state["before"])
-        for index in (self._seen, self._accepted):
-            if index is not None and index not in self.trajectory:
-                raise ValueError(f"frame {index} has no tracked pose")
         self._motions = deque(map(float, state["motions"]), maxlen=REMEMBERED)
 
 

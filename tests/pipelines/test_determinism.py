@@ -12,11 +12,9 @@ from tests.patience import PATIENCE
 
 pytestmark = pytest.mark.slow
 PROJECT = Path(__file__).resolve().parents[2]
-# The wall of test_mapping.py: every stage, with a correction, pruning, pose refinement and post refinement.
-CODE = """
-import hashlib, sys
+# Every stage, with a correction, pruning, pose refinement and post refinement.
+ONLINE = """
 import numpy as np
-from fields.runtime.backend import initialise
 from fields.frames.pose_correction import PoseCorrection
 from fields.geometry.se3 import exp_se3
 from pipelines.online import OnlineMapper
@@ -24,7 +22,6 @@ from pipelines.refinement import refine
 from pipelines.settings import RefineSettings
 from tests.pipelines.test_online import SETTINGS, frame
 
-initialise("cpu", threads=int(sys.argv[1]))
 mapper = OnlineMapper(SETTINGS, 64, 48, seed=5)
 for i in range(5):
     mapper.process(frame(i))
@@ -33,23 +30,33 @@ for i in range(5):
         assert mapper.correct(PoseCorrection(np.array([0, 3]), ends)).moved
 mapper.finish()
 refine(mapper, RefineSettings(steps=20))
-digest = hashlib.sha256()
-for value in mapper.gaussians.to_numpy().values():
-    digest.update(value.tobytes())
 for view in mapper.keyframes:
     digest.update(view.T_camera_world.tobytes())
+"""
+OFFLINE = """
+from tests.pipelines.test_offline import SETTINGS, mapper
+
+mapper = mapper(SETTINGS.model_copy(update={"steps": 200}))
+mapper.initialise()
+mapper.optimise()
+"""
+BEFORE = """
+import hashlib, sys
+from fields.runtime.backend import initialise
+digest = hashlib.sha256()
+initialise("cpu", threads=int(sys.argv[1]))
+"""
+AFTER = """
+for value in mapper.gaussians.to_numpy().values():
+    digest.update(value.tobytes())
 print(len(mapper.gaussians), digest.hexdigest())
 """
 
 
-def start(threads: int) -> subprocess.Popen[str]:
-    command = [sys.executable, "-c", CODE, str(threads)]
-    return subprocess.Popen(command, cwd=PROJECT, stdout=subprocess.PIPE, text=True)
-
-
-def test_a_map_is_the_same_byte_for_byte_on_one_thread_and_on_three() -> None:
-    runs = [start(1), start(3)]
-    count, digest = runs[0].communicate(timeout=PATIENCE)[0].split()[-2:]
-    assert runs[1].communicate(timeout=PATIENCE)[0].split()[-2:] == [count, digest]
-    assert [run.returncode for run in runs] == [0, 0]
-    assert int(count) > 300
+@pytest.mark.parametrize(("code", "least"), [(ONLINE, 300), (OFFLINE, 6 * 120)], ids=["online", "offline"])
+def test_a_map_is_the_same_byte_for_byte_on_one_thread_and_on_three(code: str, least: int) -> None:
+    command = [sys.executable, "-c", BEFORE + code + AFTER]
+    runs = [subprocess.Popen([*command, f"{n}"], cwd=PROJECT, stdout=subprocess.PIPE, text=True) for n in (1, 3)]
+    printed = [run.communicate(timeout=PATIENCE)[0].split()[-2:] for run in runs]
+    assert printed[0] == printed[1] and [run.returncode for run in runs] == [0, 0]
+    assert int(printed[0][0]) > least

@@ -24,7 +24,7 @@ from modp_ti.outputs.evaluation import (
 )
 from pipelines.online import OnlineMapper
 from pipelines.settings import MappingSettings
-from tests.pipelines.walked_wall import FRAMES, SETTINGS, still, walked, walker
+from tests.pipelines.wall import FRAMES, WALKED, still, walked, walker
 
 WHOLE = np.ones((40, 60), dtype=bool)
 
@@ -136,7 +136,7 @@ def test_means_without_what_moves_are_given_if_it_was_masked() -> None:
 @pytest.mark.usefixtures("taichi_on_the_cpu")
 def test_a_frame_is_rendered_once_and_scored_with_and_without_what_moves(monkeypatch: pytest.MonkeyPatch) -> None:
     initialise("cpu")
-    mapper = OnlineMapper(MappingSettings(**SETTINGS, transients=True), 64, 48, seed=1)
+    mapper = OnlineMapper(MappingSettings(**WALKED, transients=True), 64, 48, seed=1)
     frames = [walked(i) for i in range(FRAMES)]
     for frame in frames:
         if frame.index % 4 != 2:

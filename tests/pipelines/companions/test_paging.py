@@ -23,7 +23,7 @@ from pipelines.densify import densifier
 from pipelines.online import OnlineMapper
 from pipelines.settings import MappingSettings
 from pipelines.state import restore_state, save_state
-from tests.pipelines.long_wall import frame
+from tests.pipelines.wall import walked_along
 
 pytestmark = pytest.mark.slow
 
@@ -41,7 +41,7 @@ def mapper_of(folder: Path | None = None, **settings) -> OnlineMapper:
 
 def walk(mapper: OnlineMapper, first: int = 0, end: int = len(STEPS)) -> OnlineMapper:
     for index in range(first, end):
-        mapper.process(frame(index, STEPS[index]))
+        mapper.process(walked_along(index, STEPS[index]))
     return mapper
 
 
@@ -65,7 +65,7 @@ def unlimited(taichi_on_the_cpu: None) -> tuple[int, float]:
 def test_a_map_beyond_its_pool_is_as_large_and_as_good(unlimited: tuple[int, float], tmp_path: Path) -> None:
     mapper = mapper_of(tmp_path / "blocks", max_gaussians=4096)
     for index, step in enumerate(STEPS):
-        mapper.process(frame(index, step))
+        mapper.process(walked_along(index, step))
         assert len(mapper.gaussians) <= 4096
     mapper.finish()
     count, psnr = unlimited
@@ -115,7 +115,7 @@ def test_a_restored_map_goes_on_as_the_saved_one(taichi_on_the_cpu: None, monkey
     walk(mapper, 15, 22).finish()
     expected = mapper.all_gaussians()
     again = mapper_of()
-    restore_state(again, type(state)(arrays, state.numbers), (frame(i, STEPS[i]) for i in range(15)))
+    restore_state(again, type(state)(arrays, state.numbers), (walked_along(i, STEPS[i]) for i in range(15)))
     walk(again, 15, 22).finish()
     assert again.hidden.due == mapper.hidden.due
     assert again.densifier.voxels.nbytes == mapper.densifier.voxels.nbytes
@@ -153,7 +153,7 @@ def test_a_limit_of_memory_moves_keyframes_to_disk(taichi_on_the_cpu: None) -> N
     on_disk = [view for view in mapper.keyframes if view.pyramid[0].on_disk]
     assert on_disk
     for view in on_disk:
-        given = frame(view.index, STEPS[view.index])
+        given = walked_along(view.index, STEPS[view.index])
         np.testing.assert_array_equal(view.rgba, given.rgba)
         for name in ("xyz", "pixels", "ids"):
             np.testing.assert_array_equal(getattr(view.points, name), getattr(given.points, name))
@@ -246,7 +246,7 @@ def test_views_are_of_the_present_place_only_once_there_are_others_or_parts_of_t
     for index in range(6):
         T = np.eye(4)
         T[0, 3] = -5.0 * index
-        store.append(replace(frame(index, 0.0), T_camera_world=T))
+        store.append(replace(walked_along(index, 0.0), T_camera_world=T))
     paging = Paging(None, store, None, MappingSettings())
     paging.most_missing = 10
     assert paging.near().tolist() == [0, 1, 2, 3, 4, 5]

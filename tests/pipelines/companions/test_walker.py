@@ -12,7 +12,7 @@ from pipelines.online import OnlineMapper
 from pipelines.settings import MappingSettings
 from pipelines.state import restore_state, save_state
 from tests.pipelines.mapped_wall import fresh_mapper
-from tests.pipelines.walked_wall import FRAMES, SETTINGS, still, walked, walker
+from tests.pipelines.wall import FRAMES, WALKED, still, walked, walker
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("taichi_on_the_cpu")]
 
@@ -32,7 +32,7 @@ class Mapped:
 
 @cache
 def mapped(walks: bool, transients: bool) -> Mapped:
-    mapper = fresh_mapper(MappingSettings(**SETTINGS, transients=transients))
+    mapper = fresh_mapper(MappingSettings(**WALKED, transients=transients))
     for i in range(FRAMES):
         mapper.process(walked(i) if walks else still(i))
     mapper.finish()
@@ -63,12 +63,12 @@ def test_nothing_is_masked_where_nothing_moves() -> None:
 
 
 def test_a_restored_map_has_its_masks() -> None:
-    mapper = fresh_mapper(MappingSettings(**SETTINGS, transients=True))
+    mapper = fresh_mapper(MappingSettings(**WALKED, transients=True))
     for i in range(FRAMES):
         mapper.process(walked(i))
     mapper.finish()
     state, views = save_state(mapper), list(mapper.keyframes)
-    again = fresh_mapper(MappingSettings(**SETTINGS, transients=True))
+    again = fresh_mapper(MappingSettings(**WALKED, transients=True))
     restore_state(again, state, [walked(i) for i in range(FRAMES)])
     assert any(view.transient is not None for view in views)
     for old, new in zip(views, again.keyframes, strict=True):
