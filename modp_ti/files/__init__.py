@@ -5,25 +5,21 @@ from __future__ import annotations
 from modp_ti.files.reading import (
     LARGEST,
     input_lines,
-    limited_lines,
     open_file,
     parse_json,
     read_bytes,
     read_json,
     read_text,
     reading,
-    text_lines,
 )
 
 __all__ = [
     "LARGEST",
     "input_lines",
-    "limited_lines",
     "open_file",
     "parse_json",
     "read_bytes",
     "read_json",
     "read_text",
     "reading",
-    "text_lines",
 ]

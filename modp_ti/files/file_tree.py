@@ -10,12 +10,14 @@ from pathlib import Path
 from typing import Any
 
 from modp_ti.files.errors import InputError
-from modp_ti.files.reading import most_unpacked, open_file, parse_json, read_bytes, reading, text_encoding
+from modp_ti.files.reading import open_file, parse_json, read_bytes, reading, text_encoding
 
 ARCHIVES = (".r3d", ".zip")
 """Suffixes of recordings in one archive."""
 
 SETTING = " (source.path)"
+# A member of an archive may unpack to so many bytes, and so many times the packed ones.
+SMALL, UNPACKED = 6 << 20, 25
 
 
 class FileTree:
@@ -82,7 +84,7 @@ class FileTree:
             return read_bytes(self.path / name)
         try:
             info = self._zip.getinfo(self._inner + name)
-            if info.file_size > most_unpacked(info.compress_size):
+            if info.file_size > SMALL + UNPACKED * info.compress_size:
                 raise OSError(0, f"it claims to unpack to {info.file_size >> 20} MiB")
             return self._zip.read(info)
         except KeyError:

@@ -12,7 +12,7 @@ import json
 import os
 import traceback
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +26,6 @@ MAX_LINE = 1 << 16
 LARGEST = 1e30
 """Largest accepted magnitude of a number. No tracker writes larger ones, and their products could overflow float64."""
 
-# Packed data may unpack to this many bytes, plus a multiple of the packed ones. Text of numbers packs to a tenth.
-SMALL = 6 << 20
 # Share of the available memory that one file may take.
 SHARE = 0.25
 CGROUP_LIMITS = (
@@ -141,63 +139,36 @@ def parse_json(text: str, name: str, line: int = 1) -> Any:
         ) from None
 
 
-def text_lines(path: str | os.PathLike[str], longest: int = MAX_LINE) -> Iterator[str]:
+def input_lines(path: Path, hint: str = "", longest: int = MAX_LINE) -> Iterator[str]:
     """Iterate over the lines of a text file as of `read_text`, with their line ends.
 
     Args:
         path: The file.
+        hint: As for `reading`.
         longest: Longest line in characters.
 
     Raises:
-        OSError: As for `open_file`, and for a line that is too long.
-        UnicodeDecodeError: If the content does not decode.
+        InputError: If the file cannot be read as text, or a line is too long.
     """
-    with open_file(path) as file, io.TextIOWrapper(file, encoding=text_encoding(file.peek(2))) as text:
-        yield from limited_lines(text, longest)
-
-
-def input_lines(path: Path, hint: str = "", longest: int = MAX_LINE) -> Iterator[str]:
-    """Iterate over the lines of the user's file as `text_lines` does. Failures are reported as by `reading`."""
-    with reading(path, hint):
-        yield from text_lines(path, longest=longest)
-
-
-def limited_lines(text: io.TextIOBase, longest: int = MAX_LINE) -> Iterator[str]:
-    """Iterate over the lines of an open text stream. Raises OSError for one with more than `longest` characters."""
-    number = 0
-    while line := text.readline(longest + 1):
-        number += 1
-        if len(line) > longest:
-            raise OSError(errno.EFBIG, f"line {number} has more than {longest:,} characters")
-        yield line
-
-
-def most_unpacked(packed: int, ratio: int = 25) -> int:
-    """Return the number of bytes to which so many packed ones may unpack at most."""
-    return SMALL + ratio * packed
+    with reading(path, hint), open_file(path) as file, io.TextIOWrapper(file, text_encoding(file.peek(2))) as text:
+        number = 0
+        while line := text.readline(longest + 1):
+            number += 1
+            if len(line) > longest:
+                raise OSError(errno.EFBIG, f"line {number} has more than {longest:,} characters")
+            yield line
 
 
 def available_memory() -> int:
     """Approximate bytes that this process can still allocate: the least that machine, container and rlimit allow."""
-    return max(
-        0, min(psutil.virtual_memory().available, *(_of_container(*files) for files in CGROUP_LIMITS), _of_process())
-    )
-
-
-def _of_container(limit: str, used: str) -> int:
-    try:
-        return int(Path(limit).read_text(encoding="ascii")) - int(Path(used).read_text(encoding="ascii"))
-    except (OSError, ValueError):  # no such cgroup file, or its limit is "max"
-        return 1 << 62
-
-
-def _of_process() -> int:
-    try:
+    limits = [psutil.virtual_memory().available]
+    for limit, used in CGROUP_LIMITS:
+        with suppress(OSError, ValueError):  # there is no such cgroup file, or its limit is "max"
+            limits.append(int(Path(limit).read_text(encoding="ascii")) - int(Path(used).read_text(encoding="ascii")))
+    with suppress(ImportError, OSError, ValueError):  # Windows has no such limit
         import resource
 
         soft, _ = resource.getrlimit(resource.RLIMIT_AS)
-        if soft == resource.RLIM_INFINITY:
-            return 1 << 62
-        return soft - psutil.Process().memory_info().vms
-    except (ImportError, OSError, ValueError):  # Windows has no such limit
-        return 1 << 62
+        if soft != resource.RLIM_INFINITY:
+            limits.append(soft - psutil.Process().memory_info().vms)
+    return max(0, min(limits))

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.frames.tracked_frame import SparsePoints
-from modp_ti.files import limited_lines, open_file, read_bytes, reading
+from modp_ti.files import open_file, read_bytes, reading
 from modp_ti.files.errors import InputError
 from modp_ti.files.number_rows import read_number_rows
 from modp_ti.files.ply import parse_ply_header
@@ -66,8 +66,8 @@ def read_ply_points(path: Path) -> NDArray[np.float64]:
         raise InputError(f"{path}: the vertices have no x, y and z")
     with reading(path), np.errstate(all="ignore"):  # converting a signalling NaN to float64 warns
         if header.form == "ascii":
-            text = io.TextIOWrapper(io.BytesIO(data[header.start :]), encoding="ascii")
-            rows = list(islice((line for line in limited_lines(text) if not line.isspace()), header.count))
+            lines = data[header.start :].decode("ascii").splitlines()
+            rows = list(islice((line for line in lines if line.strip()), header.count))
             if len(rows) < header.count or any(len(row.split()) < len(header.properties) for row in rows[-1:]):
                 raise InputError(f"{path}: the PLY file is damaged or cut off")
             places = [header.names.index(axis) for axis in "xyz"]

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from fields.frames.origin import NO_ORIGIN, shifted_poses
 from fields.geometry.camera import PinholeCamera
 from fields.map.keyframes import KeyframeStore
-from modp_ti.files import LARGEST, read_bytes, read_json, reading, text_lines
+from modp_ti.files import LARGEST, input_lines, read_bytes, read_json, reading
 from modp_ti.files.atomic import replace_text, replacing
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.delivered_frames import DeliveredFrames
@@ -259,7 +259,7 @@ def read_scores(path: str | os.PathLike[str]) -> list[FrameScore]:
     """
     scores: list[FrameScore] = []
     with reading(path):
-        rows = csv.reader(text_lines(path))
+        rows = csv.reader(input_lines(path))
         if next(rows, None) != COLUMNS:
             raise InputError(f"{path}:1: the columns must be {','.join(COLUMNS)}")
         try:

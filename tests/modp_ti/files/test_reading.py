@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from modp_ti.files import open_file, parse_json, read_bytes, reading, text_lines
+from modp_ti.files import input_lines, open_file, parse_json, read_bytes, reading
 from modp_ti.files.errors import InputError
 from modp_ti.files.file_tree import open_tree
 from modp_ti.files.reading import available_memory
@@ -40,10 +40,10 @@ def test_a_file_beyond_the_memory_is_refused_unread(tmp_path: Path, monkeypatch:
 
 def test_lines_have_an_end(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("one\ntwo\nthree")
-    assert list(text_lines(tmp_path / "file")) == ["one\n", "two\n", "three"]
-    lines = text_lines(tmp_path / "file", longest=4)
+    assert list(input_lines(tmp_path / "file")) == ["one\n", "two\n", "three"]
+    lines = input_lines(tmp_path / "file", longest=4)
     assert [next(lines), next(lines)] == ["one\n", "two\n"]
-    with pytest.raises(OSError):
+    with pytest.raises(InputError):
         next(lines)
 
 
