@@ -34,7 +34,7 @@ from pipelines.settings import MappingSettings, RefineSettings
 
 FILE = "session.zip"
 # Version of the file. Others are refused.
-VERSION = 3
+VERSION = 4
 ABOUT = "about.json"
 AGAIN = "; record the session again"
 # Arrays of a correction, and of its camera where it has one.
@@ -46,7 +46,9 @@ class SessionRecorder:
     """Writes a session to a temporary file while it goes on.
 
     The file is a zip of one array file per frame or correction, in their order, and of `about.json` with the settings,
-    the decisions and the measured times. Images are kept without loss. A full disk ends the recording, not the run.
+    the decisions and the measured times. There, `events` has the number of further steps before each of them, and
+    whether another correction follows at once; null for a frame. Images are kept without loss. A full disk ends the
+    recording, not the run.
 
     Attributes:
         problem: Why the session cannot be recorded, in one line; None if it can.
@@ -58,7 +60,8 @@ class SessionRecorder:
         self._file = Path(self._folder.name) / FILE
         self._zip = zipfile.ZipFile(self._file, "w", zipfile.ZIP_STORED)
         self._vignette: NDArray[np.float32] | None = None
-        self._count = self._further = 0
+        self._events: list[tuple[int, bool | None]] = []
+        self._further = 0
         self._shares: list[float] | None = None
 
     def add_further_step(self) -> None:
@@ -72,7 +75,7 @@ class SessionRecorder:
         arrays |= {"image": image, "camera": _numbers(frame.camera), "masked": np.array(frame.mask is not None)}
         if frame.vignette is not None and frame.vignette is not self._vignette:
             self._vignette = arrays["vignette"] = frame.vignette
-        self._write(arrays)
+        self._write(arrays, None)
 
     def add_correction(self, correction: PoseCorrection, more: bool) -> None:
         """Write a correction. `more` is as in `Mapper.correct`."""
@@ -81,7 +84,7 @@ class SessionRecorder:
         if revision is not None:
             arrays["camera"] = _numbers(revision.camera)
             arrays |= {name: array for name in REVISION if (array := getattr(revision, name)) is not None}
-        self._write({**arrays, "others_stay": np.array(correction.others_stay), "more": np.array(more)})
+        self._write({**arrays, "others_stay": np.array(correction.others_stay)}, more)
 
     def recorded(self, schedule: Schedule) -> Schedule:
         """Return the schedule of a refinement, and record what it says."""
@@ -108,6 +111,7 @@ class SessionRecorder:
         decisions = {
             "version": VERSION,
             "plans": [None if plan is None else [plan.pixels, plan.steps, plan.swept] for plan in plans],
+            "events": self._events,
             "further": self._further,
             "refinement": self._shares,
         }
@@ -125,16 +129,17 @@ class SessionRecorder:
             self._zip.close()
         self._folder.cleanup()
 
-    def _write(self, arrays: dict[str, NDArray]) -> None:
+    def _write(self, arrays: dict[str, NDArray], more: bool | None) -> None:
         if self.problem is not None:
             return
         file = io.BytesIO()
-        np.savez(file, allow_pickle=False, **arrays, further=np.array(self._further))
+        np.savez(file, allow_pickle=False, **arrays)
         try:
-            self._zip.writestr(f"{self._count:06d}.npz", file.getvalue())
+            self._zip.writestr(_name(len(self._events)), file.getvalue())
         except OSError as error:
             self._fail(Path(self._folder.name), error)
-        self._count, self._further = self._count + 1, 0
+        self._events.append((self._further, more))
+        self._further = 0
 
     def _fail(self, place: Path, error: OSError) -> None:
         self.problem = f"the session is not recorded (export.session): {place}: {error.strerror}"
@@ -175,18 +180,9 @@ class RecordedSession(Tracker):
                 None if plan is None else Plan(float(plan[0]), int(plan[1]), int(plan[2])) for plan in about["plans"]
             ]
             self.shares: list[float] | None = about["refinement"]
-            self._names = sorted(name for name in self._zip.namelist() if name != ABOUT)
-            self.further: list[int] = []
-            self.more: list[bool] = []
-            self._revisions: list[CameraRevision] = []
-            for name in self._names:
-                arrays = self._arrays(name)
-                self.further.append(int(arrays["further"]))
-                if "more" in arrays:
-                    self.more.append(bool(arrays["more"]))
-                    revision = _correction(arrays).camera
-                    self._revisions += [] if revision is None else [revision]
-            self.further.append(int(about["further"]))
+            self._events: list[tuple[int, bool | None]] = about["events"]
+            self.further = [*(further for further, _ in self._events), int(about["further"])]
+            self.more = [more for _, more in self._events if more is not None]
 
     @property
     def notes(self) -> list[str]:
@@ -194,10 +190,11 @@ class RecordedSession(Tracker):
 
     @property
     def frame_count(self) -> int:
-        return len(self._names) - len(self.more)
+        return len(self._events) - len(self.more)
 
     def pictures(self, names: Sequence[str]) -> Iterator[tuple[str, Picture]]:
-        later, wanted = list(self._revisions), set(names)
+        corrections = (_correction(self._arrays(n)) for n, (_, more) in enumerate(self._events) if more is not None)
+        later, wanted = [each.camera for each in corrections if each.camera is not None], set(names)
         for event in self:
             if isinstance(event, PoseCorrection):
                 del later[: event.camera is not None]
@@ -207,19 +204,23 @@ class RecordedSession(Tracker):
 
     def __iter__(self) -> Iterator[Event]:
         vignette = None
-        for name in self._names:
+        for number, (_, more) in enumerate(self._events):
             with reading(self.path, AGAIN):
-                arrays = self._arrays(name)
+                arrays = self._arrays(number)
                 vignette = arrays.get("vignette", vignette)
-                event = _frame(arrays, vignette) if "image" in arrays else _correction(arrays)
+                event = _frame(arrays, vignette) if more is None else _correction(arrays)
             yield event
 
     def close(self) -> None:
         self._zip.close()
 
-    def _arrays(self, name: str) -> dict[str, NDArray]:
-        with np.load(io.BytesIO(self._zip.read(name)), allow_pickle=False) as archive:
+    def _arrays(self, number: int) -> dict[str, NDArray]:
+        with np.load(io.BytesIO(self._zip.read(_name(number))), allow_pickle=False) as archive:
             return dict(archive)
+
+
+def _name(number: int) -> str:
+    return f"{number:06d}.npz"
 
 
 def _numbers(camera: PinholeCamera) -> NDArray[np.float64]:

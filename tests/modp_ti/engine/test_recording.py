@@ -15,10 +15,11 @@ import pytest
 
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
+from modp_ti.config.scene_file import load_scene, scene_from_data
 from modp_ti.engine.recording import FILE, RecordedSession, SessionRecorder
+from modp_ti.engine.session import run_scene
 from modp_ti.files.errors import InputError
 from pipelines.companions.pace import Plan
-from tests.modp_ti.runs import run
 from tests.pipelines.wall import CAMERA, frame
 
 if TYPE_CHECKING:
@@ -40,15 +41,14 @@ def test_a_recorded_run_is_repeated_byte_by_byte(room_recording: RoomRecording, 
     room_recording.write(tmp_path)
     scene = tmp_path / "scene.yaml"
     scene.write_text(RUN)
-    recorded = run(scene)
-    assert recorded.returncode == 0, recorded.stderr
+    out = run_scene(load_scene(scene))
     for name in ("images", "sparse"):  # the recording needs nothing else
         (tmp_path / name).rename(tmp_path / f"other-{name}")
-    repeated = run(Path("--replay"), str(tmp_path / "out"))
-    assert repeated.returncode == 0, repeated.stderr
-    assert repeated.stdout == f"written to {tmp_path / 'out-replayed'}\n"
+    session = RecordedSession(out)
+    again = scene_from_data(session.settings | {"output": str(tmp_path / "again")}, "the session")
+    run_scene(again, replayed=session)
     for name in ("splats.ply", "trajectory.txt"):
-        assert (tmp_path / "out-replayed" / name).read_bytes() == (tmp_path / "out" / name).read_bytes(), name
+        assert (tmp_path / "again" / name).read_bytes() == (out / name).read_bytes(), name
     live = json.loads((tmp_path / "out" / "metrics.json").read_text())["live"]
     assert live["arrived"] == live["tracked"] == 9 and live["seconds_to_map"] > 0.5
 
