@@ -18,7 +18,7 @@ from modp_ti.inputs.bare_recording import base_of, named_scene
 from modp_ti.inputs.scene_paths import refuse_output_in_input
 from modp_ti.many.pool import Ended, Pool, Resources, Running
 from modp_ti.many.results import (
-    ProgressTable,
+    BatchProgress,
     SceneResult,
     State,
     figures,
@@ -189,15 +189,15 @@ class _Batch:
         self._configs = {scene.name: scene.config for scene in scenes if scene.config is not None}
         self._results = {scene.name: _before(scene) for scene in scenes}
         self._submitted: dict[str, Resources] = {}  # of the scenes that have not ended
-        self._table = ProgressTable(console, lambda: list(self._results.values()))
+        self._line = BatchProgress(console, len(self._results))
 
     def run(self) -> list[SceneResult]:
         self._write()
-        with self._table, Interruption(lambda: None) as stop:
+        with self._line, Interruption(lambda: None) as stop:
             stop.begin()
             for result in self._results.values():
                 if result.state is not State.waiting:
-                    self._table.ended(result)
+                    self._line.ended(result)
             try:
                 self._submit_all()
                 while self._submitted and not stop.asked:
@@ -222,7 +222,7 @@ class _Batch:
 
     def _stop(self) -> None:
         """Have the scenes that run save what they have, and raise KeyboardInterrupt."""
-        self._table.note("stopping when all scenes have saved what they have; Ctrl-C again stops at once")
+        self._line.note("stopping when all scenes have saved what they have; Ctrl-C again stops at once")
         self._pool.stop()
         until = monotonic() + PATIENCE
         while self._submitted and monotonic() < until:
@@ -238,7 +238,7 @@ class _Batch:
             name, known = event.name, self._results[event.name]
             if isinstance(event, Running):
                 self._change(name, machine=event.machine, attempts=known.attempts or 1)
-                self._table.running(name, event.machine, event.progress)
+                self._line.running(name, event.machine, event.progress)
                 continue
             if event.end is not End.interrupted or event.machine:
                 self._change(name, attempts=known.attempts or 1, machine=event.machine or known.machine)
@@ -246,12 +246,12 @@ class _Batch:
             lost = event.end in (End.lost, End.interrupted)  # nobody has asked it to end
             if retry and lost and attempts < self._shares.attempts:
                 self._change(name, attempts=attempts + 1)
-                self._table.retried(name, attempts + 1, event.error)
+                self._line.retried(name, attempts + 1, event.error)
                 self._submit(name)
                 continue
             del self._submitted[name]
             self._ended(event, stopped=not retry)
-        self._table.tick()
+        self._line.tick()
 
     def _ended(self, event: Ended, stopped: bool) -> None:
         """Note the end of a scene. Where its files are here, it is finished, whatever the event says."""
@@ -262,7 +262,7 @@ class _Batch:
             here, error = False, str(problem)
         if here:
             if event.end is End.fault:
-                self._table.note(f"{event.name}: after its files were complete: {event.error}")
+                self._line.note(f"{event.name}: after its files were complete: {event.error}")
             self._end(event.name, State.finished)
         elif stopped and event.end is End.interrupted:
             self._end(event.name, State.waiting)
@@ -272,7 +272,7 @@ class _Batch:
     def _end(self, name: str, state: State, error: str = "") -> None:
         metrics = finished_metrics(self._configs[name]) if state.is_done else None
         self._change(name, state=state, error=error, figures={} if metrics is None else figures(metrics))
-        self._table.ended(self._results[name])
+        self._line.ended(self._results[name])
         self._write_later()
 
     def _change(self, name: str, **changes: object) -> None:
@@ -291,7 +291,7 @@ class _Batch:
         try:
             self._write()
         except InputError as error:
-            self._table.note(str(error))
+            self._line.note(str(error))
 
 
 def _before(scene: Scene) -> SceneResult:

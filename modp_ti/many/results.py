@@ -1,11 +1,11 @@
-"""Results of a batch: a row for each scene; their tables, the summary page, and the table on the terminal."""
+"""Results of a batch: a row for each scene; their tables, the summary page, and the lines on the terminal."""
 
 from __future__ import annotations
 
 import csv
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
@@ -13,8 +13,6 @@ from typing import Any
 from urllib.parse import quote
 
 from rich.console import Console
-from rich.live import Live
-from rich.table import Table
 from rich.text import Text
 
 from modp_ti.files.atomic import replace_text, replacing
@@ -175,35 +173,31 @@ def _link(folder: Path, result: SceneResult) -> str | None:
 
 # ---- on the terminal ------------------------------------------------------------------------------------------------
 
-# Rows of the table at most: scenes that run or have failed come before the others.
-MOST_ROWS = 40
-COLOURS = {State.finished: "green", State.before: "green", State.failed: "red"}
-ORDER = (State.failed, State.waiting, State.finished, State.before)
 
+class BatchProgress:
+    """Shows the progress of a batch: a line for each begin and end of a scene, and how far those are that run.
 
-class ProgressTable:
-    """Shows the progress of a batch. It is a context manager, inside which the table is on the screen.
+    On a terminal, the latter is one line that changes. It is shown inside this object as a context manager.
 
     Args:
         console: Where it is shown.
-        results: Returns the results so far, in the order of the rows.
+        scenes: Number of the scenes.
     """
 
-    def __init__(self, console: Console, results: Callable[[], Sequence[SceneResult]]) -> None:
+    def __init__(self, console: Console, scenes: int) -> None:
         self._console = console
-        self._results = results
-        self._running: dict[str, tuple[str, float, str]] = {}  # machine, when it began [s], and how far it is
+        self._scenes = scenes
+        self._done = 0
+        self._running: dict[str, str] = {}  # how far each scene is
         self._logged = time.monotonic()
-        self._live = Live(console=console, get_renderable=self.table, refresh_per_second=2, transient=False)
+        self._status = console.status("")
 
-    def __enter__(self) -> ProgressTable:
-        if self._console.is_terminal:
-            self._live.start()
+    def __enter__(self) -> BatchProgress:
+        self._status.start()
         return self
 
     def __exit__(self, *error: object) -> None:
-        if self._console.is_terminal:
-            self._live.stop()
+        self._status.stop()
 
     def note(self, text: str) -> None:
         """Print a note for the user."""
@@ -212,9 +206,8 @@ class ProgressTable:
     def running(self, name: str, machine: str, progress: str) -> None:
         """Show that a scene runs, and how far it is if that is known."""
         if name not in self._running:
-            self._line(f"{name}: begun on {machine}")
-        _, since, before = self._running.get(name, ("", time.monotonic(), ""))
-        self._running[name] = machine, since, progress or before
+            self.note(f"{name}: begun on {machine}")
+        self._running[name] = progress or self._running.get(name, "")
 
     def retried(self, name: str, attempt: int, error: str) -> None:
         """Show that a scene waits again, after its process or machine was lost."""
@@ -224,52 +217,19 @@ class ProgressTable:
     def ended(self, result: SceneResult) -> None:
         """Show the end of a scene."""
         self._running.pop(result.name, None)
-        if result.state is State.failed:
-            self.note(f"{result.name}: failed: {result.error}")
-        else:
-            self._line(f"{result.name}: {result.state.value}{_figures(result)}")
+        self._done += result.state.is_done
+        row = result.row
+        which, figures = (row["scored"] or "").replace("_", "-"), ""
+        if row["psnr"] is not None:
+            figures = f", {row['frames']} frames, {row['gaussians']:,} Gaussians, {which} PSNR {row['psnr']:.2f} dB"
+        self.note(f"{result.name}: {result.state.value}{figures}{result.error and ': '}{result.error}")
 
     def tick(self) -> None:
-        """Print how far the scenes are, every 30 seconds where there is no terminal. Call it often."""
-        if self._console.is_terminal or time.monotonic() - self._logged < LOG_EVERY:
-            return
-        self._logged = time.monotonic()
-        for name, (_, _, progress) in self._running.items():
-            if progress:
-                self.note(f"{name}: {progress}")
-
-    def table(self) -> Table:
-        """Return the table as it is now. Cells are `Text`, as names and errors may hold the brackets of markup."""
-        results = self._results()
-        counts = {state: sum(result.state is state for result in results) for state in State}
-        table = Table(box=None, pad_edge=False, title_justify="left", title_style="bold")
-        table.title = (
-            f"{sum(result.state.is_done for result in results)} of {len(results)} finished, "
-            f"{len(self._running)} running, "
-            f"{counts[State.waiting] - len(self._running)} waiting, {counts[State.failed]} failed"
-        )
-        for name in ("scene", "state", "machine", "progress"):
-            table.add_column(name, no_wrap=True, overflow="ellipsis")
-        rank = lambda result: 0 if result.name in self._running else 1 + ORDER.index(result.state)  # noqa: E731
-        for result in sorted(results, key=rank)[:MOST_ROWS]:
-            state, style = result.state.value, COLOURS.get(result.state, "")
-            machine, what = result.machine, result.error or _figures(result).removeprefix(", ")
-            if result.name in self._running:
-                machine, since, what = self._running[result.name]
-                minutes, seconds = divmod(int(time.monotonic() - since), 60)
-                state, style = f"running {minutes}:{seconds:02d}", ""
-            table.add_row(Text(result.name), Text(state, style=style), Text(machine), Text(what))
-        return table
-
-    def _line(self, text: str) -> None:
-        """Print what a terminal shows in the table."""
-        if not self._console.is_terminal:
-            self.note(text)
-
-
-def _figures(result: SceneResult) -> str:
-    row = result.row
-    if row["psnr"] is None:
-        return ""
-    which = (row["scored"] or "").replace("_", "-")
-    return f", {row['frames']} frames, {row['gaussians']:,} Gaussians, {which} PSNR {row['psnr']:.2f} dB"
+        """Show how far the scenes are, every 30 seconds where there is no terminal. Call it often."""
+        far = [f"{name}: {progress}" for name, progress in self._running.items() if progress]
+        running = f"{self._done} of {self._scenes} scenes finished, {len(self._running)} running"
+        self._status.update(Text("; ".join([running, *far])))
+        if not self._console.is_terminal and time.monotonic() - self._logged >= LOG_EVERY:
+            self._logged = time.monotonic()
+            for line in far:
+                self.note(line)
