@@ -170,19 +170,13 @@ def parse_header(data: bytes, hello: Hello | None) -> tuple[Kind, int]:
             too short.
     """
     magic, version, kind, length, zero = HEADER.unpack(data)
-    if magic != MAGIC:
-        raise ProtocolError(f"a message must begin with 'MODP', not with the bytes {magic.hex(' ')}")
-    if version != VERSION:
-        raise ProtocolError(f"version {version} is not spoken here: send version {VERSION}")
-    if zero:
-        raise ProtocolError(f"the last 4 bytes of the header must be 0, not {zero}")
-    if kind not in (Kind.HELLO, Kind.FRAME, Kind.POSE, Kind.CORRECTION, Kind.END):
-        raise ProtocolError(f"message kind {kind} is not known: 1 HELLO, 2 FRAME, 3 POSE, 4 CORRECTION, 5 END")
+    _require(magic == MAGIC, f"a message must begin with 'MODP', not with the bytes {magic.hex(' ')}")
+    _require(version == VERSION, f"version {version} is not spoken here: send version {VERSION}")
+    _require(zero == 0, f"the last 4 bytes of the header must be 0, not {zero}")
+    known = (Kind.HELLO, Kind.FRAME, Kind.POSE, Kind.CORRECTION, Kind.END)
+    _require(kind in known, f"message kind {kind} is not known: 1 HELLO, 2 FRAME, 3 POSE, 4 CORRECTION, 5 END")
     kind = Kind(kind)
-    if kind is not Kind.HELLO and hello is None:
-        raise ProtocolError(f"{kind.name} before HELLO: the first message must be HELLO")
-    if kind is Kind.HELLO and hello is not None:
-        raise ProtocolError("HELLO twice: it is the first message alone")
+    _require((kind is Kind.HELLO) == (hello is None), f"{kind.name}: HELLO must be the first message, and no other")
     least, most = {
         Kind.HELLO: (HELLO.size, HELLO.size + MAX_NAME),
         Kind.FRAME: (FRAME.size, FRAME.size + MAX_POINTS * POINT.itemsize + (hello.image_bytes if hello else 0)),
@@ -193,8 +187,7 @@ def parse_header(data: bytes, hello: Hello | None) -> tuple[Kind, int]:
         ),
         Kind.END: (0, 0),
     }[kind]
-    if not least <= length <= most:
-        raise ProtocolError(f"a {kind.name} of {length} bytes: its payload has {least} to {most}")
+    _require(least <= length <= most, f"a {kind.name} of {length} bytes: its payload has {least} to {most}")
     return kind, length
 
 
@@ -202,27 +195,20 @@ def parse_hello(payload: bytes) -> Hello:
     """Parse the payload of HELLO. Raises ProtocolError for an invalid camera, encoding or name."""
     width, height, encoding, lens, *numbers = HELLO.unpack_from(payload)
     (fx, fy, cx, cy), k = numbers[:4], numbers[4:]
-    if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE and width * height <= MAX_PIXELS):
-        raise ProtocolError(f"HELLO: images of {width}x{height} are not taken: at most {MAX_PIXELS:,} pixels")
-    if encoding not in tuple(Encoding):
-        raise ProtocolError(f"HELLO: image encoding {encoding} is not known: {_choices(Encoding)}")
-    if not all(map(math.isfinite, numbers)):
-        raise ProtocolError("HELLO: intrinsics and distortion must be finite numbers")
-    if not (fx > 0 and fy > 0):
-        raise ProtocolError(f"HELLO: focal lengths must be positive, not {fx:g} and {fy:g}")
-    if not (-width < cx < 2 * width and -height < cy < 2 * height):
-        raise ProtocolError(f"HELLO: the principal point ({cx:g}, {cy:g}) is far outside of {width}x{height} pixels")
-    if lens == 0:
-        distortion = NO_DISTORTION
-    elif lens == 1:
-        distortion = Distortion((k[0], k[1], k[4]), tuple(k[5:8]), (k[2], k[3]))
-    elif lens == 2:
-        distortion = Distortion(tuple(k[:4]), fisheye=True)
-    else:
-        raise ProtocolError(f"HELLO: lens model {lens} is not known: 0 none, 1 k1 k2 p1 p2 k3 k4 k5 k6, 2 fisheye")
-    used = {0: 0, 1: 8, 2: 4}[lens]
-    if any(k[used:]):
-        raise ProtocolError(f"HELLO: lens model {lens} has {used} coefficients, the others must be 0")
+    fits = 0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE and width * height <= MAX_PIXELS
+    _require(fits, f"HELLO: images of {width}x{height} are not taken: at most {MAX_PIXELS:,} pixels")
+    _require(encoding in tuple(Encoding), f"HELLO: image encoding {encoding} is not known: {_choices(Encoding)}")
+    _require(all(map(math.isfinite, numbers)), "HELLO: intrinsics and distortion must be finite numbers")
+    _require(fx > 0 and fy > 0, f"HELLO: focal lengths must be positive, not {fx:g} and {fy:g}")
+    inside = -width < cx < 2 * width and -height < cy < 2 * height
+    _require(inside, f"HELLO: the principal point ({cx:g}, {cy:g}) is far outside of {width}x{height} pixels")
+    _require(lens in (0, 1, 2), f"HELLO: lens model {lens} is not known: 0 none, 1 k1 k2 p1 p2 k3 k4 k5 k6, 2 fisheye")
+    used, distortion = (
+        (0, NO_DISTORTION),
+        (8, Distortion((k[0], k[1], k[4]), tuple(k[5:8]), (k[2], k[3]))),
+        (4, Distortion(tuple(k[:4]), fisheye=True)),
+    )[lens]
+    _require(not any(k[used:]), f"HELLO: lens model {lens} has {used} coefficients, the others must be 0")
     try:
         name = payload[HELLO.size :].decode("utf-8")
     except UnicodeDecodeError:
@@ -250,25 +236,21 @@ def parse_frame(payload: bytes, kind: Kind, place: int = 0) -> Frame:
     """
     number, state, timestamp, *matrix, count, length = FRAME.unpack_from(payload)
     what = f"{kind.name} {number}"
-    if count > MAX_POINTS:
-        raise ProtocolError(f"{what}: {count} points, at most {MAX_POINTS} are taken")
+    _require(count <= MAX_POINTS, f"{what}: {count} points, at most {MAX_POINTS} are taken")
     middle = FRAME.size + count * POINT.itemsize
-    size = middle + length
-    if size != len(payload):
-        raise ProtocolError(
-            f"{what}: {count} points and {length} bytes of image make {size} bytes of payload, it has {len(payload)}"
-        )
-    if (length > 0) != (kind is Kind.FRAME):
-        raise ProtocolError(f"{what}: {'has no image' if kind is Kind.FRAME else 'must have no image'}")
-    if state not in tuple(State):
-        raise ProtocolError(f"{what}: state {state} is not known: {_choices(State)}")
+    size, had = middle + length, len(payload)
+    _require(
+        size == had, f"{what}: {count} points and {length} bytes of image make {size} bytes, its payload has {had}"
+    )
+    is_frame = kind is Kind.FRAME
+    _require((length > 0) == is_frame, f"{what}: {'has no image' if is_frame else 'must have no image'}")
+    _require(state in tuple(State), f"{what}: state {state} is not known: {_choices(State)}")
     state = State(state)
-    if kind is Kind.POSE and state is State.LATER:
-        raise ProtocolError(f"{what}: must bring the pose (state 1) or say that none will come (state 2)")
+    brings = is_frame or state is not State.LATER
+    _require(brings, f"{what}: must bring the pose (state 1) or say that none will come (state 2)")
+    _require(not count or state is State.KNOWN, f"{what}: has points and no pose: they come with it")
     if not abs(timestamp) <= LARGEST:
         raise UnfitError(f"{what}: the time stamp is not finite, or beyond {LARGEST:g}", number)
-    if count and state is not State.KNOWN:
-        raise ProtocolError(f"{what}: has points and no pose: they come with it")
     try:
         pose = _pose(np.array(matrix).reshape(4, 4), what) if state is State.KNOWN else None
         points = parse_points(payload[FRAME.size : middle], what)
@@ -295,8 +277,8 @@ def parse_correction(payload: bytes) -> Correction:
     poses, points = CORRECTION.unpack_from(payload)
     middle = CORRECTION.size + poses * MOVED_POSE.itemsize
     size = middle + points * MOVED_POINT.itemsize
-    if poses == 0 or size != len(payload):
-        raise ProtocolError(f"CORRECTION: {poses} poses and {points} points make {size} bytes, it has {len(payload)}")
+    had = len(payload)
+    _require(poses > 0 and size == had, f"CORRECTION: {poses} poses, {points} points make {size} bytes, it has {had}")
     frames = np.frombuffer(payload[CORRECTION.size : middle], dtype=MOVED_POSE)
     numbers = frames["number"].astype(np.int64)
     if (np.diff(numbers) <= 0).any():
@@ -304,6 +286,11 @@ def parse_correction(payload: bytes) -> Correction:
     matrices = [_pose(row["T"], f"CORRECTION of frame {row['number']}") for row in frames]
     moved = _points(payload[middle:], MOVED_POINT, "CORRECTION")
     return Correction(numbers, np.stack(matrices), moved["id"].astype(np.int64), moved["xyz"].astype(np.float64))
+
+
+def _require(holds: bool, otherwise: str) -> None:
+    if not holds:
+        raise ProtocolError(otherwise)
 
 
 def _points(block: bytes, layout: np.dtype, what: str) -> NDArray:

@@ -166,12 +166,12 @@ class TrackingProcess(Tracker):
         self._ended = True
         with suppress(OSError):
             self._connection.send(None)  # the process exits when it notices
-        self._connection.close()
         try:
             self._process.wait(PATIENCE)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
+        self._connection.close()  # last, as another thread may read from it until the process has ended
         self._interrupt.give_back()
         if self._kept is not None:
             self._kept.cleanup()
