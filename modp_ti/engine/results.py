@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.frames.tracked_frame import TrackedFrame
-from fields.map.keyframes import KeyframeStore
 from fields.runtime.engine import engine
 from modp_ti.config.scene_file import dump_scene
 from modp_ti.config.settings import SceneConfig
@@ -84,23 +83,27 @@ class Results:
         """Whether the map is in the output folder, after `writing_map`."""
         return is_run_folder(self.config.output) and (self.config.output / "splats.ply").is_file()
 
-    def write_map(self, version: MapVersion, keyframes: KeyframeStore, near: float) -> None:
+    def write_map(self, version: MapVersion, pipeline: Pipeline) -> None:
         """Write the map. Raises InputError if `splats.ply` is not read back as it was written."""
-        write_map(self.folder, version, self.frames, self._names, keyframes, near, self.undistorter)
+        self._write_map(self.folder, version, pipeline)
         check_splats(self.folder / "splats.ply", version.gaussians, self.frames.from_origin)
 
-    def elsewhere(self, version: MapVersion, keyframes: KeyframeStore, near: float) -> str:
+    def elsewhere(self, version: MapVersion, pipeline: Pipeline) -> str:
         """Write the map to a new temporary folder, which stays; return the part of an error message that says so."""
         folder = None
         try:
             folder = Path(tempfile.mkdtemp(prefix="modp-ti-map-"))
-            write_map(folder, version, self.frames, self._names, keyframes, near, self.undistorter)
+            self._write_map(folder, version, pipeline)
             dump_scene(self.config, folder / "config.yaml")
         except OSError as error:
             if folder is not None:
                 shutil.rmtree(folder, ignore_errors=True)
             return f"; nor can {tempfile.gettempdir()}: {error.strerror}, and the map is lost"
         return f"; the map is in {folder}"
+
+    def _write_map(self, folder: Path, version: MapVersion, pipeline: Pipeline) -> None:
+        store, near = pipeline.keyframes, pipeline.near
+        write_map(folder, version, self.frames, self._names, store, near, self.undistorter)
 
     def write_frame(self, frame: TrackedFrame, render: NDArray[np.float32]) -> None:
         """Write the pictures of a frame, given its render (H, W, 3), and keep those that the report may show.

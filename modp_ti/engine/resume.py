@@ -283,8 +283,8 @@ def _saved(mapper: Mapper, keeper: Checkpointer, results: Results) -> str:
             continue  # without the damaged block, of which there are finitely many
     try:
         with results.writing_map():
-            results.write_map(version, pipeline.keyframes, pipeline.near)
+            results.write_map(version, pipeline)
     except InputError as error:
-        way_on = keeper.way_on() or results.elsewhere(version, pipeline.keyframes, pipeline.near)
+        way_on = keeper.way_on() or results.elsewhere(version, pipeline)
         raise InputError(f"{error}{way_on}") from None
     return f"; the map so far is in {keeper.path.parent}"

@@ -86,11 +86,11 @@ def write_results(finished: FinishedMap) -> None:
     pipeline, keeper, output, results = stream.pipeline, stream.keeper, run.config.output, stream.results()
 
     def way_on() -> str:
-        return keeper.way_on() or results.elsewhere(finished.last, pipeline.keyframes, pipeline.near)
+        return keeper.way_on() or results.elsewhere(finished.last, pipeline)
 
     try:
         with results.writing_map(), run.line.working("writing the map"):
-            results.write_map(finished.last, pipeline.keyframes, pipeline.near)
+            results.write_map(finished.last, pipeline)
             run.conductor.write_session(results.folder, run.config)
     except InputError as error:
         raise InputError(f"{error}{way_on()}") from None
