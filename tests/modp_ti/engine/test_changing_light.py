@@ -67,7 +67,7 @@ def held_out_psnr(frames: list[TrackedFrame], **exposure: object) -> float:
     return float(np.mean(scores))
 
 
-@pytest.mark.parametrize("enabled", [True, "auto"])
-def test_estimated_exposure_wins_at_least_four_decibels(frames: list[TrackedFrame], enabled: bool | str) -> None:
+def test_estimated_exposure_wins_at_least_four_decibels(frames: list[TrackedFrame]) -> None:
     # 8.6 to 11.6 dB over three seeds of the light.
-    assert held_out_psnr(frames, enabled=enabled) > held_out_psnr(frames, enabled=False) + 4.0
+    fixed = held_out_psnr(frames, enabled=False)
+    assert min(held_out_psnr(frames, enabled=enabled) for enabled in (True, "auto")) > fixed + 4.0

@@ -15,12 +15,13 @@ from send_frames import RGBA8, Sender
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
 from fields.runtime.backend import initialise
+from modp_ti.config.scene_file import load_scene
+from modp_ti.engine.session import run_scene
 from modp_ti.inputs.delivered_frames import DeliveredFrames
 from modp_ti.outputs.evaluation import absolute_trajectory_error
 from modp_ti.outputs.formats.trajectory import read_trajectory, write_trajectory
 from pipelines.online import OnlineMapper
 from pipelines.settings import MappingSettings
-from tests.modp_ti.runs import finished_run
 from tests.patience import PATIENCE
 from tests.room import Room, RoomRecording, pinhole
 from tests.simulated_tracker import drifting, loop, noisy_poses, tracked
@@ -90,6 +91,7 @@ output:  out
 device:  cpu
 mapping: {optimise: {steps: 2}, densify: {warm_up: 3}}
 refine:  {steps: 2}
+export:  {report: false}
 """
 
 
@@ -119,7 +121,8 @@ def folder(frames: list[TrackedFrame], tmp_path_factory: pytest.TempPathFactory)
     write_trajectory(place / "truth.txt", [frame.timestamp for frame in frames], loop(len(frames)))
     sender = Thread(target=send, args=(drifting(frames, 0.05), place / "server"), daemon=True)
     sender.start()
-    out = finished_run(place, SCENE, "21 frames")
+    (place / "scene.yaml").write_text(SCENE)
+    out = run_scene(load_scene(place / "scene.yaml"))
     sender.join()
     return out
 

@@ -1,19 +1,21 @@
-"""Runs of a small room in `mode: offline`, as a user starts them: in processes of their own."""
+"""Runs of a small room in `mode: offline`."""
 
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 
+from modp_ti.config.scene_file import load_scene
+from modp_ti.engine.session import run_scene
+from modp_ti.files.errors import InputError
 from modp_ti.outputs.formats.splats_ply import read_splats
 from modp_ti.outputs.formats.trajectory import read_trajectory
 from tests.modp_ti.outputs.report.made_up_run import Page
-from tests.modp_ti.runs import FILES, finished_run, run
+from tests.modp_ti.runs import FILES
 
 if TYPE_CHECKING:
     from tests.room import RoomRecording
@@ -35,7 +37,8 @@ def folder(room_recording: RoomRecording, tmp_path_factory: pytest.TempPathFacto
     """The output folder of one run."""
     place = tmp_path_factory.mktemp("offline")
     room_recording.write(place)
-    return finished_run(place, SCENE, "9 frames, 6 keyframes")
+    (place / "scene.yaml").write_text(SCENE)
+    return run_scene(load_scene(place / "scene.yaml"))
 
 
 def test_a_run_leaves_the_files_that_an_online_run_leaves(folder: Path) -> None:
@@ -69,17 +72,14 @@ def test_the_splats_have_the_harmonics_of_degree_three(folder: Path) -> None:
 
 
 def test_the_written_configuration_gives_the_same_map_byte_for_byte(folder: Path, tmp_path: Path) -> None:
-    result = run(folder / "config.yaml", "--set", f"output={tmp_path / 'again'}")
-    assert result.returncode == 0, result.stderr
+    again = [f"output={tmp_path / 'again'}", "evaluation.scores=false", "export.report=false"]
+    run_scene(load_scene(folder / "config.yaml", again))
     assert (tmp_path / "again" / "splats.ply").read_bytes() == (folder / "splats.ply").read_bytes()
 
 
 def test_frames_without_points_are_an_error_of_one_line(folder: Path, tmp_path: Path) -> None:
-    for name in ("images", "sparse"):
-        (tmp_path / name).symlink_to(folder.parent / name)
-    scene = Path(shutil.copy(folder.parent / "scene.yaml", tmp_path))
     # Only a frame that is held out.
-    result = run(scene, "--quiet", "--set", "offline.sh_degree=0", "source.stop=1")
-    assert result.returncode == 2
-    assert (result.stderr[:7], result.stderr.count("\n")) == ("error: ", 1)
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["images", "scene.yaml", "sparse"]
+    config = load_scene(folder.parent / "scene.yaml", ["source.stop=1", f"output={tmp_path / 'out'}"])
+    with pytest.raises(InputError, match=r"^[^\n]+$"):
+        run_scene(config)
+    assert not (tmp_path / "out").exists()

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import json
-import signal
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,17 +13,19 @@ import numpy as np
 import pycolmap
 import pytest
 from numpy.typing import NDArray
+from rich.console import Console
 
 from fields.frames.origin import shifted_poses
 from fields.geometry.se3 import exp_se3, inverse_se3, moved_points, moved_pose
-from modp_ti.engine.snapshot import FILE
+from modp_ti.config.scene_file import load_scene
+from modp_ti.engine.session import run_scene
+from modp_ti.files.errors import InputError
 from modp_ti.outputs.formats.run_files import read_masks, read_scores
 from modp_ti.outputs.formats.splats_ply import read_splats
 from modp_ti.outputs.formats.trajectory import read_trajectory, write_trajectory
 from modp_ti.outputs.playback.finished_run import open_run
-from tests.modp_ti.engine.test_resume import position, stop_midway
+from tests.modp_ti.engine.stopped_runs import kill, resumed_run, stopped_run
 from tests.modp_ti.outputs.locating.painted_room import CAMERA, another_room, write_run
-from tests.modp_ti.runs import run
 from tests.room import Room, RoomRecording, walk, write_colmap
 
 pytestmark = pytest.mark.slow
@@ -105,10 +105,10 @@ def second(first: Path, made_once: Callable[[str, Callable[[Path], None]], Path]
 
     def fill(folder: Path) -> None:
         before = content(first)
-        result = run(second_scene(room, folder), "--onto", str(first))
-        assert result.returncode == 0, result.stderr
+        said = io.StringIO()
+        run_scene(load_scene(second_scene(room, folder), [f"onto={first}"]), Console(file=said, width=1000))
         assert content(first) == before, "the first visit is only read"
-        (folder / "said").write_text(result.stderr)
+        (folder / "said").write_text(said.getvalue())
 
     return made_once("a second visit", fill) / "out"
 
@@ -142,26 +142,27 @@ def test_a_second_visit_lands_in_the_first_one_and_goes_on(first: Path, second: 
     assert psnr[:FIRST].min() > 25 and psnr[FIRST:-3].min() > 25
 
 
-def test_a_third_visit_that_is_killed_goes_on_as_one_in_peace(second: Path, tmp_path: Path) -> None:
+def test_a_third_visit_that_is_killed_ends_as_one_in_peace(
+    second: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """It finds the images of both earlier visits, locates the recording again, and comes to the same place.
 
     The high box is gone, so that keyframes of the earlier visits are masked.
     """
     scene = second_scene(Room(without=[2]), tmp_path)
-    options = ["--onto", str(second), "--set", "snapshot_every=2", "--set", "export.report=false"]
-    assert run(scene, *options).returncode == 0
-    peace = (tmp_path / "out").rename(tmp_path / "peace")
+    plain = ["snapshot_every=2", "source.stop=9", "export.report=false", "evaluation.scores=false"]
+    config = load_scene(scene, [f"onto={second}", *plain])
+    peace = run_scene(config).rename(tmp_path / "peace")
     names = open_run(second).names
-    assert open_run(peace).names == names + [f"visit3/{name.removeprefix('visit2/')}" for name in names[FIRST:]]
+    assert open_run(peace).names == names + [f"visit3/{number:04d}.png" for number in range(9)]
 
     masks = read_masks(peace / "masks")
     assert masks and all(place < len(names) for place in masks)
 
     out = tmp_path / "out"
-    stop_midway([str(scene), *options], out, lambda: position(out / FILE)[0] > len(names), signal.SIGKILL)
-    result = subprocess.run([sys.executable, "-m", "modp_ti.run", "--resume", str(out)], check=False)
-    assert result.returncode == 0
-    for name in ("splats.ply", "trajectory.txt", "scores.csv"):
+    stopped_run(monkeypatch, lambda: run_scene(config), "mapping", 4, kill)
+    resumed_run(out)
+    for name in ("splats.ply", "trajectory.txt"):
         assert (out / name).read_bytes() == (peace / name).read_bytes(), name
     for place, mask in read_masks(out / "masks").items():
         np.testing.assert_array_equal(mask, masks.pop(place))
@@ -170,12 +171,8 @@ def test_a_third_visit_that_is_killed_goes_on_as_one_in_peace(second: Path, tmp_
 
 def test_a_recording_of_another_place_is_refused_in_one_line(first: Path, tmp_path: Path) -> None:
     scene = second_scene(another_room(), tmp_path)
-    result = run(scene, "--onto", str(first), "--quiet")
-    assert result.returncode == 2
-    assert result.stderr.startswith("error: onto: 0 of ") and result.stderr.count("\n") == 1
+    with pytest.raises(InputError, match=r"^onto: 0 of [^\n]+$"):
+        run_scene(load_scene(scene, [f"onto={first}"]))
     assert not (tmp_path / "out").exists()
-
-
-def test_the_first_visit_is_not_written_to(first: Path, room: Room, tmp_path: Path) -> None:
-    result = run(second_scene(room, tmp_path), "--onto", str(first), "--quiet", "--set", f"output={first}")
-    assert result.returncode == 2 and f"{first} (onto)" in result.stderr
+    with pytest.raises(InputError, match=r"\(onto\)"):  # the first visit is not written to
+        run_scene(load_scene(scene, [f"onto={first}", f"output={first}"]))
