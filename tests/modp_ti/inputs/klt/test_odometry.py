@@ -42,22 +42,10 @@ def a_turn_on_the_spot_before_the_walk(room: BoxRoom, walk: Walk) -> Sequence:
     return [*map(room.grey, turns), *walk.grey[:35]], [*turns, *walk.poses[:35]]
 
 
-@sequence(0.01)
-def repeated_frames(room: BoxRoom, walk: Walk) -> Sequence:
-    return [g for g in walk.grey[:30] for _ in range(2)], [T for T in walk.poses[:30] for _ in range(2)]
-
-
 @sequence(0.02)
 def black_frames(room: BoxRoom, walk: Walk) -> Sequence:
     greys = [BLACK, BLACK, *walk.grey[:30], BLACK, BLACK, BLACK, *walk.grey[27:50]]
     return greys, [None, None, *walk.poses[:30], None, None, None, *walk.poses[27:50]]
-
-
-@sequence(0.02)
-def frames_of_another_place(room: BoxRoom, walk: Walk) -> Sequence:
-    rng = np.random.default_rng(3)
-    elsewhere = [np.kron(rng.integers(0, 255, (30, 40)), np.ones((8, 8))).astype(np.uint8) for _ in range(4)]
-    return [*walk.grey[:30], *elsewhere, *walk.grey[20:40]], [*walk.poses[:30], *[None] * 4, *walk.poses[20:40]]
 
 
 @sequence(0.02)

@@ -9,7 +9,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from PIL import Image
 
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
@@ -76,30 +75,6 @@ def test_frames_keep_the_contract_of_a_tracker_and_corrections_lead_to_the_last_
         np.testing.assert_array_equal(frame.image, frames[frame.index].image)
         np.testing.assert_array_equal(frame.points.ids, frames[frame.index].points.ids)
         assert np.median(off_pixels(frame)) < 0.3
-
-
-def test_images_that_exif_turns_are_tracked_like_upright_ones(box_room, box_walk, tmp_path):
-    exif, camera = Image.Exif(), box_room.camera
-    exif[0x0112] = 6  # stored on its side, shown after a turn clockwise
-    for name in ("stored", "upright"):
-        (tmp_path / name).mkdir()
-    for i, image in enumerate(box_walk.images[:30]):
-        file = tmp_path / "stored" / f"{i:04d}.jpg"
-        Image.fromarray(np.rot90(image)).save(file, exif=exif, quality=95)
-        stored = cv2.imread(str(file), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-        assert stored.shape == (320, 240, 3)
-        cv2.imwrite(str(tmp_path / "upright" / f"{i:04d}.png"), cv2.rotate(stored, cv2.ROTATE_90_CLOCKWISE))
-    intrinsics = IntrinsicsSettings(fx=camera.fx, fy=camera.fy, cx=camera.cx, cy=camera.cy)
-    stored, upright = (
-        list(settled(open_klt(SourceSettings(path=tmp_path / name, intrinsics=intrinsics))))
-        for name in ("stored", "upright")
-    )
-    assert len(stored) == len(upright) == 30
-    for a, b in zip(stored, upright, strict=True):
-        assert a.camera == b.camera == camera
-        np.testing.assert_array_equal(a.image, b.image)
-        np.testing.assert_array_equal(a.T_camera_world, b.T_camera_world)
-        np.testing.assert_array_equal(a.points.pixels, b.points.pixels)
 
 
 def test_frames_without_a_pose_are_not_counted_and_masked_points_not_delivered(box_room, box_walk, tmp_path):

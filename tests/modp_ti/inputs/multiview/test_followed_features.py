@@ -51,28 +51,6 @@ def posed(video, camera: Undistorter | None = None) -> tuple[ImageFolder, list[P
     return images, [PosedImage(name, undistorter, T) for name, T in zip(images.names, video[1], strict=True)]
 
 
-def on_plane(T: np.ndarray, rays: np.ndarray) -> np.ndarray:
-    """Where (N, 2) rays meet the plane z = 0: the oracle."""
-    p = np.c_[rays, np.ones(len(rays))] @ np.linalg.inv(T[:3, [0, 1, 3]]).T
-    return p[:, :2] / p[:, 2:]
-
-
-def test_a_corner_stays_on_its_place_of_the_plane(video):
-    images, frames = posed(video)
-    found = follow_features(images, frames, np.ones(FRAMES, bool))
-    places = np.zeros((len(found), 2))
-    for i, T in enumerate(video[1]):
-        places[found.frame == i] = on_plane(T, found.rays[found.frame == i])
-    long = np.flatnonzero(np.bincount(found.point) >= 8)
-    assert len(long) > 100
-    spread = [np.linalg.norm(np.ptp(places[found.point == track], axis=0)) for track in long]
-    pixel = 3.0 / CAMERA.fx  # its size on the plane
-    assert np.median(spread) < 0.7 * pixel
-    assert np.percentile(spread, 90) < 2.0 * pixel
-    keys = found.frame * (found.point.max() + 1) + found.point
-    assert len(np.unique(keys)) == len(keys), "a track has one place in a frame"
-
-
 def test_points_lie_on_the_plane_and_keep_their_numbers(video, monkeypatch):
     monkeypatch.setattr(triangulation, "FEW_FRAMES", 5)
     images, frames = posed(video)

@@ -111,10 +111,6 @@ def walk_that_comes_home(count: int) -> list[Features]:
     return [Features(np.zeros((100, 2)), words[which], 1.0) for which in shown]
 
 
-def test_few_images_are_all_matched() -> None:
-    assert image_pairs(walk_that_comes_home(12), 2, 0) == [(i, j) for i in range(12) for j in range(i + 1, 12)]
-
-
 def test_a_sequence_is_matched_with_its_neighbours_and_where_it_comes_home() -> None:
     count = 2 * ALL_PAIRS
     pairs = image_pairs(walk_that_comes_home(count), 5, 0)
