@@ -75,7 +75,7 @@ def verdict(findings: Iterable[Finding]) -> tuple[str, int]:
     return ("warnings", 1) if Severity.WARNING in severities else ("fine", 0)
 
 
-def each_view(check: Callable[[Sequence[FrameRecord]], list[int]]) -> Callable[[Sequence[FrameRecord]], list[int]]:
+def _each_view(check: Callable[[Sequence[FrameRecord]], list[int]]) -> Callable[[Sequence[FrameRecord]], list[int]]:
     """Apply a check to the frames of each view of a rig by themselves, and return the indices of all frames found."""
 
     @wraps(check)
@@ -86,7 +86,7 @@ def each_view(check: Callable[[Sequence[FrameRecord]], list[int]]) -> Callable[[
     return checked
 
 
-@each_view
+@_each_view
 def blurred(frames: Sequence[FrameRecord]) -> list[int]:
     """Indices of frames that are less sharp than their neighbours."""
     sharp = np.array([frame.sharpness for frame in frames])
@@ -98,13 +98,13 @@ def blurred(frames: Sequence[FrameRecord]) -> list[int]:
     return result
 
 
-@each_view
+@_each_view
 def duplicates(frames: Sequence[FrameRecord]) -> list[int]:
     """Indices of frames whose image repeats the one before."""
     return [i for i, frame in enumerate(frames) if frame.change < SAME and frame.masked < 1]
 
 
-@each_view
+@_each_view
 def time_gaps(frames: Sequence[FrameRecord]) -> list[int]:
     """Indices of frames that follow a gap in time."""
     steps = np.diff([frame.timestamp for frame in frames])
@@ -113,8 +113,8 @@ def time_gaps(frames: Sequence[FrameRecord]) -> list[int]:
     return (np.flatnonzero(steps > GAP * np.median(steps)) + 1).tolist()
 
 
-@each_view
-def steps_back(frames: Sequence[FrameRecord]) -> list[int]:
+@_each_view
+def _steps_back(frames: Sequence[FrameRecord]) -> list[int]:
     """Indices of frames that are not later than the one before."""
     return (np.flatnonzero(np.diff([frame.timestamp for frame in frames]) <= 0) + 1).tolist()
 
@@ -124,7 +124,7 @@ def judge_sequence(frames: Sequence[FrameRecord]) -> Iterator[Finding]:
     sizes = sorted({(frame.camera.width, frame.camera.height) for frame in frames})
     if len(sizes) > 1:
         yield note("sizes", f"images of several sizes: {', '.join(f'{w}x{h}' for w, h in sizes)}")
-    back = steps_back(frames)
+    back = _steps_back(frames)
     if len(back):
         text = f"time does not go on at {len(back)} frames: {_names(frames, back)}"
         yield warning("time_order", text, "sort the frames by time, or mend the times")

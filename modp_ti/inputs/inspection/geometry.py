@@ -164,7 +164,7 @@ def judge_geometry(geometry: Geometry) -> Iterator[Finding]:
         )
 
 
-def best_convention(geometry: Geometry) -> Convention:
+def _best_convention(geometry: Geometry) -> Convention:
     """Return the convention that the matched features fit far better than that stated, or the stated one."""
     stated, best = geometry.epipolar[STATED], min(CONVENTIONS, key=lambda c: geometry.epipolar[c].error)
     score = geometry.epipolar[best]
@@ -173,7 +173,7 @@ def best_convention(geometry: Geometry) -> Convention:
 
 
 def _by_features(geometry: Geometry) -> Iterator[Finding]:
-    stated, best = geometry.epipolar[STATED], best_convention(geometry)
+    stated, best = geometry.epipolar[STATED], _best_convention(geometry)
     score = geometry.epipolar[best]
     numbers = f"{stated.share:.0%} of {stated.matches:,} matched features fit, median error {stated.error:.2f} px"
     if best is not STATED:
@@ -229,7 +229,7 @@ def require_fitting(tracker: Tracker) -> None:
     seen = survey((frame for _, frame in looked_at), len(looked_at), lambda _: None, PLACES)
     geometry = measure_geometry(seen, further)
     stated = geometry.epipolar[STATED]
-    few = FEW_WITHOUT_REMEDY if best_convention(geometry) is STATED else FEW
+    few = FEW_WITHOUT_REMEDY if _best_convention(geometry) is STATED else FEW
     if stated.matches >= LEAST_MATCHES:
         fits = stated.share >= few
     else:

@@ -125,7 +125,7 @@ def survey(
             features[place] = detect_features(rgb)
         for a in wanted:
             if place - a in gaps and a in features:
-                pair = matched_pair(a, features[a], place, features[place])
+                pair = _matched_pair(a, features[a], place, features[place])
                 if pair is not None:
                     result.pairs.append(pair)
         features.pop(place - gaps[-1], None)
@@ -173,18 +173,8 @@ def _thumbnail(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
     return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.float32)
 
 
-def matched_pair(a: int, features_a: Features, b: int, features_b: Features) -> MatchedPair | None:
-    """Match two images without using their poses.
-
-    Args:
-        a: Index of the first frame.
-        features_a: Its features.
-        b: Index of the second frame.
-        features_b: Its features.
-
-    Returns:
-        The matches that are inliers of a fundamental matrix; None if there are too few.
-    """
+def _matched_pair(a: int, features_a: Features, b: int, features_b: Features) -> MatchedPair | None:
+    """Match frames a and b without their poses: the inliers of a fundamental matrix; None if there are too few."""
     pairs = match_anywhere(features_a, features_b)
     if len(pairs) < FEWEST_MATCHES:
         return None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,15 +23,6 @@ NOTABLE = 2.0
 MOVED = 0.2
 
 
-@dataclass
-class _Delivered:
-    """A delivered frame: the name of its image, its view, and T_camera_world (4, 4) as it was delivered."""
-
-    name: str
-    view: View
-    T_camera_world: NDArray[np.float64]
-
-
 class DeliveredTrajectory:
     """Frames and landmarks as the mapper has them.
 
@@ -41,11 +31,11 @@ class DeliveredTrajectory:
         undistorter: Undistortion of the delivered images.
 
     Attributes:
-        frames: The delivered frames in order.
+        views: The delivered views in order.
     """
 
     def __init__(self, tracking: Tracking, undistorter: Undistorter) -> None:
-        self.frames: list[_Delivered] = []
+        self.views: list[View] = []
         self._tracking = tracking
         self._undistorter = undistorter
         # By number: the keyframes of delivered frames, with their delivered poses.
@@ -55,9 +45,9 @@ class DeliveredTrajectory:
         self._remembered = 0  # the first frame that still has its landmarks
 
     def add(self, name: str, view: View) -> PosedImage:
-        """Add the next frame. Returns it with the landmarks whose reprojection error is small."""
+        """Add the next frame, of an image's name. Returns it with the landmarks whose reprojection error is small."""
         landmarks, camera, T = self._tracking.map, self._undistorter.camera, self._tracking.pose(view)
-        self.frames.append(_Delivered(name, view, T))
+        self.views.append(view)
         if view.keyframe not in self._keyframes:
             self._remember([view.keyframe])
         xyz, rays = landmarks.xyz[view.ids], landmarks.lens.rays(view.pixels)
@@ -75,9 +65,9 @@ class DeliveredTrajectory:
 
     def forget_points(self) -> None:
         """Forget the landmarks of all frames, once the camera is final. Poses are still corrected."""
-        for frame in self.frames[self._remembered :]:
-            frame.view.forget_landmarks()
-        self._remembered = len(self.frames)
+        for view in self.views[self._remembered :]:
+            view.forget_landmarks()
+        self._remembered = len(self.views)
 
     def corrections(self, last: bool = False) -> Iterator[PoseCorrection]:
         """Yield one correction, with the frames of all moved keyframes, if a keyframe has moved notably.
@@ -95,7 +85,7 @@ class DeliveredTrajectory:
         if max(moved.values()) < (MOVED if last else NOTABLE):
             return
         affected = {number for number, shift in moved.items() if shift >= MOVED}
-        index = [i for i, frame in enumerate(self.frames) if frame.view.keyframe in affected]
+        index = [i for i, view in enumerate(self.views) if view.keyframe in affected]
         known = self._known()
         away = np.linalg.norm(landmarks.xyz[known] - self._xyz[known], axis=1)
         ids = known[away > MOVED * self._depth(self._keyframe(max(affected))) / landmarks.lens.focal]
@@ -108,9 +98,9 @@ class DeliveredTrajectory:
             undistorter: Undistortion of the delivered images with the new camera.
         """
         revision, self._undistorter = undistorter.revising(self._undistorter), undistorter
-        for frame in self.frames:
-            self._tracking.relocalise(frame.view)
-        return self._corrected(range(len(self.frames)), list(self._keyframes), self._known(), revision)
+        for view in self.views:
+            self._tracking.relocalise(view)
+        return self._corrected(range(len(self.views)), list(self._keyframes), self._known(), revision)
 
     def _corrected(
         self,
@@ -120,11 +110,9 @@ class DeliveredTrajectory:
         camera: CameraRevision | None = None,
     ) -> PoseCorrection:
         """The correction of the frames of `index`, whose keyframes are given, and of landmarks (N,)."""
-        for i in index:
-            self.frames[i].T_camera_world = self._tracking.pose(self.frames[i].view)
         self._remember(keyframes)
         xyz = self._xyz[ids] = self._tracking.map.xyz[ids]
-        poses = np.stack([self.frames[i].T_camera_world for i in index])
+        poses = np.stack([self._tracking.pose(self.views[i]) for i in index])
         return PoseCorrection(np.array(index, dtype=np.int64), poses, ids, xyz, camera, camera is None)
 
     def _known(self) -> NDArray[np.int64]:

@@ -153,13 +153,10 @@ def _lit_alike(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> NDArray[n
 
 
 def _gains_of_rows(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> NDArray[np.float32] | None:
-    """Factors (H,) from the brightness of each row of `before` to that of `after`, where bands are lit differently.
+    """Factors (H,) from the brightness of each row of `before` to that of `after`; None if no bands are lit apart.
 
     Lamps that flicker with the mains, and a sensor that exposes its rows one after the other, give bands that wander
     over the image. A scene that moves changes the brightness of rows too, but not alike in all columns.
-
-    Returns:
-        The factors; None if there are no bands.
     """
     then, now = (
         np.log1p(cv2.resize(each, (STRIPS, BANDS), interpolation=cv2.INTER_AREA).astype(np.float32))

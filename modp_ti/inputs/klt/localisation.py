@@ -251,14 +251,7 @@ def _warps(
 def _patches(
     grey: NDArray[np.uint8], centres: NDArray[np.float64], warps: NDArray[np.float64], side: int
 ) -> NDArray[np.uint8]:
-    """Patches (N, side, side) of an image, sampled bilinearly.
-
-    Args:
-        grey: (H, W).
-        centres: (N, 2) pixels of the patches' centres, with pixel centres at +0.5.
-        warps: (N, 2, 2) from offsets in the patch to offsets in the image.
-        side: Width and height [px] of the patches.
-    """
+    """Patches (N, side, side) of an image around pixels (N, 2), by warps (N, 2, 2) of offsets in them to it."""
     # In cv2 the first pixel's centre is 0.
     to_image = np.empty((len(centres), 2, 3))
     to_image[:, :, :2] = warps

@@ -140,7 +140,7 @@ class LoopClosing:
             T_of_by = each.of.T_camera_world @ inverse_se3(each.T_camera_world) @ np.diag([s, s, s, 1.0])
             links.append((index(each.of.number), index(each.by.number), T_of_by))
         depth = float(np.median([each.depth for each in found]))
-        after.move(closed_loop(poses, connected_keyframes(landmarks), links, depth))
+        after.move(closed_loop(poses, _connected_keyframes(landmarks), links, depth))
         return after if connected(after, found, apart=True) else None, True
 
     def _loop(self, landmarks: LandmarkMap, since: int) -> list[Recognition]:
@@ -197,7 +197,7 @@ class LoopClosing:
             self.undone += 1
 
 
-def connected_keyframes(landmarks: LandmarkMap) -> list[tuple[int, int]]:
+def _connected_keyframes(landmarks: LandmarkMap) -> list[tuple[int, int]]:
     """Pairs of keyframes that follow each other or share at least NEAR_SHARED landmarks."""
     of, ids, _ = landmarks.observations(range(len(landmarks.keyframes)))
     _, column = np.unique(ids, return_inverse=True)

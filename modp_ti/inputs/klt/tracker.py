@@ -157,7 +157,7 @@ class KltTracker(Tracker):
         arrivals = self._reader.images.arrivals
         if arrivals is None:
             return None
-        tracked = 0 if self._trajectory is None else len(self._trajectory.frames)
+        tracked = 0 if self._trajectory is None else len(self._trajectory.views)
         return LiveCounts(arrivals.arrived, tracked, arrivals.thinned, self._skipped, 0, arrivals.newest)
 
     @property
@@ -198,7 +198,7 @@ class KltTracker(Tracker):
             )
         yield from self._delivered_events(views, last=True)
         if self._trajectory is not None:
-            self._skipped = len(names) - len(self._trajectory.frames)
+            self._skipped = len(names) - len(self._trajectory.views)
             yield from self._trajectory.corrections(last=True)
         self._notes += self._summary()
 
@@ -224,11 +224,11 @@ class KltTracker(Tracker):
         if trajectory is None:
             trajectory = self._trajectory = DeliveredTrajectory(tracking, self._delivered)
         waiting = 0 if last else sum(map(len, self._odometry.waiting))
-        self._skipped = len(names) - len(trajectory.frames) - len(views) - waiting
+        self._skipped = len(names) - len(trajectory.views) - len(views) - waiting
         for view in views:
             posed = trajectory.add(names[view.number], view)
             own = raw if view.number == len(names) - 1 else None
-            frame = tracked_frame(self._reader, len(trajectory.frames) - 1, posed, raw=own)
+            frame = tracked_frame(self._reader, len(trajectory.views) - 1, posed, raw=own)
             trajectory.record(frame.points)
             yield frame
         if tracking.camera_is_final:
@@ -251,7 +251,7 @@ class KltTracker(Tracker):
             yield estimation_note(self.intrinsics, self._estimated_from)
         if self._unreadable:
             yield self._unreadable.note(len(names))
-        placed = {frame.name for frame in self._trajectory.frames} | set(self._unreadable)
+        placed = {names[view.number] for view in self._trajectory.views} | set(self._unreadable)
         without = [name for name in names if name not in placed]
         if without:
             yield (

@@ -32,30 +32,6 @@ SAME_ASPECT = 0.005
 MOST_VIEWS = 400
 
 
-@dataclass(frozen=True)
-class PictureCamera:
-    """The camera of a picture.
-
-    Attributes:
-        intrinsics: The camera of the stored picture.
-        known: Whether the intrinsics are known. Otherwise they are a guess of the focal length.
-        note: Where they are from, for the user.
-    """
-
-    intrinsics: Intrinsics
-    known: bool
-    note: str
-
-
-def read_picture(path: Path) -> NDArray[np.uint8]:
-    """Decode an image file (H, W, 3) uint8 RGB, turned as EXIF says, as the images of a run.
-
-    Raises:
-        UnreadableImageError: If the file cannot be read as an image.
-    """
-    return ListedImages(path.parent, [path.name], [0.0]).read(path.name)
-
-
 def given_camera(text: str) -> IntrinsicsSettings:
     """Parse a camera such as `fx=525.5,cx=320,k1=-0.03`, with the keys of `source.intrinsics`.
 
@@ -67,41 +43,30 @@ def given_camera(text: str) -> IntrinsicsSettings:
     return scene_from_data(scene, f"--camera {text}", overrides).source.intrinsics
 
 
-def camera_of(run: FinishedRun, width: int, height: int, given: IntrinsicsSettings | None = None) -> PictureCamera:
+def _camera_of(
+    run: FinishedRun, width: int, height: int, given: IntrinsicsSettings | None
+) -> tuple[Intrinsics, bool, str]:
     """Choose the camera of a picture of `width` x `height` pixels.
 
     It is the given one; or that of the run, if the shape of the picture is that of the run's images; or else a guess
-    with the field of view of the run.
-
-    Args:
-        run: The finished run.
-        width: Width of the stored picture [px].
-        height: Height of the stored picture [px].
-        given: The user's intrinsics; None, or without `fx`, if there are none.
-
-    Raises:
-        InputError: If the given intrinsics belong to another image size.
+    with the field of view of the run. Returns it, whether it is known, and where it is from.
     """
     size = f"{width}x{height}"
     if given is not None and given.given:
-        return PictureCamera(given_intrinsics(given, width, height), True, f"{size} pictures: the given camera")
+        return given_intrinsics(given, width, height), True, f"{size} pictures: the given camera"
     mapped = Intrinsics(run.cameras[run.record.keyframes[0]])
     stored = run.record.stored_camera
     # A picture of exactly the mapped size is one that was undistorted with the run's images, or rendered.
-    undistorted = (width, height) == (mapped.camera.width, mapped.camera.height)
-    own = mapped if stored is None or (undistorted and not _is_size(stored.camera, width, height)) else stored
+    sizes = [(each.camera.width, each.camera.height) for each in (mapped, stored or mapped)]
+    own = mapped if stored is None or (sizes[0] == (width, height) != sizes[1]) else stored
     if abs(own.camera.width * height / (own.camera.height * width) - 1.0) <= SAME_ASPECT:
         lens = "" if stored is not None else ", without lens distortion, which the run has not recorded"
         camera = Intrinsics(own.camera.resized(width, height), own.distortion)
-        return PictureCamera(camera, True, f"{size} pictures: the run's camera{lens}")
+        return camera, True, f"{size} pictures: the run's camera{lens}"
     focal = mapped.camera.focal * max(width, height) / max(mapped.camera.width, mapped.camera.height)
     guess = PinholeCamera(focal, focal, width / 2, height / 2, width, height)
     note = f"{size} pictures are not of the run's camera: their focal length is estimated; --camera gives it"
-    return PictureCamera(Intrinsics(guess), False, note)
-
-
-def _is_size(camera: PinholeCamera, width: int, height: int) -> bool:
-    return (camera.width, camera.height) == (width, height)
+    return Intrinsics(guess), False, note
 
 
 @dataclass(frozen=True)
@@ -196,14 +161,15 @@ class Locator(Tenant):
         if isinstance(picture, np.ndarray):
             raw, name = picture, name or "picture"
         else:
-            raw, name = read_picture(Path(picture)), name or os.fspath(picture)
+            path = Path(picture)  # decoded and turned as the images of a run
+            raw, name = ListedImages(path.parent, [path.name], [0.0]).read(path.name), name or os.fspath(picture)
         height, width = raw.shape[:2]
-        chosen = camera_of(self._run, width, height, camera)
-        undistorter = chosen.intrinsics.undistorter(min(1.0, self._side / max(width, height)))
+        intrinsics, known, note = _camera_of(self._run, width, height, camera)
+        undistorter = intrinsics.undistorter(min(1.0, self._side / max(width, height)))
         image, valid = undistorter.image(raw)
-        found = self._search.find(image, valid, undistorter.camera, not chosen.known)
+        found = self._search.find(image, valid, undistorter.camera, not known)
         if isinstance(found, str):
-            return Location(name, reason=found, note=chosen.note)
+            return Location(name, reason=found, note=note)
         return Location(
             name,
             shifted_poses(found.T_camera_world, self._run.record.origin),
@@ -212,7 +178,7 @@ class Locator(Tenant):
             found.likeness,
             found.covariance,
             found.camera.resized(width, height),
-            chosen.note,
+            note,
         )
 
     def place(self, frame: TrackedFrame) -> PlacedFrame | str:

@@ -83,7 +83,7 @@ class MapViews:
     """
 
     def __init__(self, renderer: MapRenderer, shots: Iterable[tuple[PinholeCamera, NDArray[np.float64]]]) -> None:
-        self._views = [rendered_features(renderer, camera, T) for camera, T in shots]
+        self._views = [_rendered_features(renderer, camera, T) for camera, T in shots]
         self._appearance = Appearance([features for features, _ in self._views])
 
     def matches(self, features: Features) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -96,7 +96,7 @@ class MapViews:
         return np.concatenate([xyz for xyz, _ in found]), np.concatenate([pixels for _, pixels in found])
 
 
-def rendered_features(
+def _rendered_features(
     renderer: MapRenderer, camera: PinholeCamera, T_camera_world: NDArray[np.float64]
 ) -> PlacedFeatures:
     """Detect features in a render of the map, and place them by its depth. Those without a sound depth are dropped."""
@@ -186,7 +186,7 @@ class Search:
         if found is None or np.count_nonzero(found.inlier) < FEWEST:
             return "too few of its features are those of the map"
         for _ in range(ROUNDS):
-            xyz, pixels = matched(rendered_features(self._renderer, found.camera, found.T_camera_world), features)
+            xyz, pixels = matched(_rendered_features(self._renderer, found.camera, found.T_camera_world), features)
             found = resect(xyz, pixels, found.camera, MAX_ERROR_THERE, self._seed, estimate_focal)
             if found is None or np.count_nonzero(found.inlier) < FEWEST_THERE:
                 return "the map does not show its features from where they seem to be seen"
@@ -202,7 +202,7 @@ class Search:
         valid: NDArray[np.bool_],
     ) -> Found | str:
         """Compare the picture with the render from a pose. Returns why the pose cannot be right, if it cannot."""
-        xyz, pixels = matched(rendered_features(self._renderer, camera, T), features)
+        xyz, pixels = matched(_rendered_features(self._renderer, camera, T), features)
         inlier = pixel_errors(camera, T, xyz, pixels) <= MAX_ERROR_THERE
         # A place with several orientations is several features.
         inliers = len(np.unique(pixels[inlier], axis=0))
