@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
-from typing import Protocol
 
 import cv2
 import numpy as np
@@ -68,14 +67,21 @@ def _blurred(picture: NDArray[np.float32]) -> NDArray[np.float32]:
     return blurred.reshape(picture.shape)
 
 
-class Poses(Protocol):
-    """Poses and exposures of all frames in a version of the map, see `MapVersion`."""
+@dataclass(frozen=True)
+class MapVersion:
+    """A copy of a map at one point of a run.
 
-    @property
-    def trajectory(self) -> Sequence[NDArray[np.float64]]: ...
+    Attributes:
+        gaussians: Arrays by name, as from `GaussianField.to_numpy`.
+        trajectory: T_camera_world (4, 4) of every frame.
+        exposures: Exposure (3, 4) of every frame, or None.
+        view_renders: Number of views that were rendered and differentiated to make the map.
+    """
 
-    @property
-    def exposures(self) -> Sequence[NDArray[np.float64] | None]: ...
+    gaussians: dict[str, NDArray]
+    trajectory: list[NDArray[np.float64]]
+    exposures: list[NDArray[np.float64] | None]
+    view_renders: int
 
 
 @dataclass(frozen=True)
@@ -101,11 +107,11 @@ class StillScorer:
 
     Args:
         pipeline: Holds the version of the map whenever `score` is called.
-        version: Its poses and exposures.
+        version: The version.
         shown: Loads it.
     """
 
-    def __init__(self, pipeline: Pipeline, version: Poses, shown: ShownMap) -> None:
+    def __init__(self, pipeline: Pipeline, version: MapVersion, shown: ShownMap) -> None:
         self._pipeline = pipeline
         self._version = version
         self._views = list(pipeline.keyframes)
@@ -137,23 +143,6 @@ class StillScorer:
         values = self._pipeline.loss.forward()
         moving_share = 1.0 - (rgba[..., 3] > 0).sum() / max((frame.rgba[..., 3] > 0).sum(), 1)
         return StillScore(values.psnr, values.ssim, float(moving_share))
-
-
-@dataclass(frozen=True)
-class MapVersion:
-    """A copy of a map at one point of a run.
-
-    Attributes:
-        gaussians: Arrays by name, as from `GaussianField.to_numpy`.
-        trajectory: T_camera_world (4, 4) of every frame.
-        exposures: Exposure (3, 4) of every frame, or None.
-        view_renders: Number of views that were rendered and differentiated to make the map.
-    """
-
-    gaussians: dict[str, NDArray]
-    trajectory: list[NDArray[np.float64]]
-    exposures: list[NDArray[np.float64] | None]
-    view_renders: int
 
 
 @dataclass(frozen=True)

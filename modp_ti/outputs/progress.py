@@ -309,7 +309,8 @@ class ProgressLine:
         self._progress.add_task(what, total=total, completed=done, state="", left="")
         _shown.add(self)
         self._progress.start()
-        self._tell()
+        if self._watch is not None:
+            self._watch(StageProgress(what, done, total))
 
     def frame(self, report: FrameReport | None, total: int | None = None, live: LiveStatus | None = None) -> None:
         """Count a finished frame.
@@ -358,39 +359,24 @@ class ProgressLine:
         )
 
     def _update(self, **changes: Any) -> None:
+        """Change the line, with the time left, tell the watcher, and log now and then."""
         if self._progress is None:
             raise RuntimeError("no progress is shown: call `start` first")
         task = self._progress.tasks[0]
         self._progress.update(task.id, **changes)
-        text = "" if task.finished else self._time_left(int(task.completed), task.total)
-        self._progress.update(task.id, left=text)
-        progress = self._tell()
-        if self.console.is_terminal or time.monotonic() - self._logged < LOG_EVERY:
-            return
-        self._logged = time.monotonic()
-        self.note(str(progress))
-
-    def _tell(self) -> StageProgress:
-        """Return the progress of the current stage, after passing it to `watch`."""
-        assert self._progress is not None, "callers have started it"
-        task = self._progress.tasks[0]
-        total = None if task.total is None else int(task.total)
-        progress = StageProgress(
-            task.description, int(task.completed), total, task.fields["state"], task.fields["left"]
-        )
-        if self._watch is not None:
-            self._watch(progress)
-        return progress
-
-    def _time_left(self, done: int, total: float | None) -> str:
-        """Return the words for the time left after `done` of `total` items, "" if it is not known."""
-        self._left.total = None if total is None else int(total)
+        done, total = int(task.completed), None if task.total is None else int(task.total)
+        self._left.total = total
         self._left.update(done)
         left, pace = self._left.seconds(), self._left.pace()
-        if left is None or pace is None:
-            return ""
-        later = self._later(pace)
-        return "" if later is None else f"  {duration(left + later)} left"
+        later = None if left is None or pace is None or task.finished else self._later(pace)
+        text = "" if left is None or later is None else f"  {duration(left + later)} left"
+        self._progress.update(task.id, left=text)
+        progress = StageProgress(task.description, done, total, task.fields["state"], text)
+        if self._watch is not None:
+            self._watch(progress)
+        if not self.console.is_terminal and time.monotonic() - self._logged >= LOG_EVERY:
+            self._logged = time.monotonic()
+            self.note(str(progress))
 
 
 def _nothing(_: float) -> float:
