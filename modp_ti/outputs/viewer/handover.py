@@ -90,10 +90,9 @@ class ThreadClock:
         for clock, before in list(self._last.items()):
             try:
                 self._last[clock] = time.clock_gettime(clock)
+                taken += self._last[clock] - before
             except OSError:  # the thread has ended
                 del self._last[clock]
-            else:
-                taken += self._last[clock] - before
         return taken
 
 
@@ -154,18 +153,15 @@ class Gate:
         self._step = False
         self._changed = threading.Condition()
 
-    def pause(self, paused: bool, holder: int | None = None) -> None:
+    def pause(self, paused: bool, holder: int | None = None, step: bool = False) -> None:
+        """Close or open the gate; with `step`, let one frame or step through before it is closed."""
         with self._changed:
-            self.paused, self.holder = paused, holder
-            self._step = False
+            self.paused, self.holder, self._step = paused, holder, step
             self._changed.notify_all()
 
     def step(self, holder: int | None = None) -> None:
         """Let one frame or step through, then pause."""
-        with self._changed:
-            self.paused = self._step = True
-            self.holder = holder
-            self._changed.notify_all()
+        self.pause(True, holder, step=True)
 
     def wake(self) -> None:
         """Make a waiting `hold` call its `meanwhile` now."""
