@@ -34,6 +34,63 @@ PATIENCE = 10.0
 PAUSE = 1.0
 
 
+class StoredFrames(ImageSource):
+    """The frames of a live source in a folder, as PNG files. Frame n is called `live_<n, six digits>`.
+
+    Args:
+        folder: The folder, which exists.
+        names: Names of the frames that are there, in order.
+        path: What messages call the source; None for the folder.
+    """
+
+    def __init__(self, folder: Path, names: Sequence[str] = (), path: Path | None = None) -> None:
+        super().__init__(folder if path is None else path, names, [0.0] * len(names))
+        self.folder = folder
+
+    def file(self, number: int) -> Path:
+        """Place of the n-th delivered frame."""
+        return self.folder / f"{number:06d}.png"
+
+    def _write(self, file: Path, image: NDArray[np.uint8]) -> None:
+        """Store a frame (H, W, 3) BGR in one of these files.
+
+        Raises:
+            InputError: If it cannot be written, or would leave too little of the disk free.
+        """
+        import cv2
+
+        # Huffman coding of differences to the left takes half the time of OpenCV's default for the same size.
+        how = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY]
+        if hasattr(cv2, "IMWRITE_PNG_FILTER"):  # since OpenCV 4.11
+            how += [cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB]
+        _, data = cv2.imencode(".png", image, how)
+        try:
+            if not has_room(self.folder, len(data)):
+                raise InputError(
+                    f"{self.folder.parent}: less than 1 GiB is free for the frames of the live source; make room, or "
+                    "set TMPDIR to a folder that has some"
+                )
+            file.write_bytes(data.data)
+        except OSError as error:
+            file.unlink(missing_ok=True)
+            raise InputError(
+                f"{self.folder}: frames of the live source cannot be kept there: {error.strerror}; "
+                "make room, or set TMPDIR to a folder that has some"
+            ) from None
+
+    def read(self, name: str) -> NDArray[np.uint8]:
+        """Read a delivered frame (H, W, 3) uint8 RGB.
+
+        Raises:
+            InputError: If the file is missing or damaged.
+        """
+        file = self.file(int(name.rpartition("_")[2]))
+        image = decoded(file.read_bytes()) if file.is_file() else None
+        if image is None:
+            raise InputError(f"{file}: the frame that was kept there is gone or damaged: leave the folder alone")
+        return image
+
+
 @dataclass
 class _Captured:
     """A frame (H, W, 3) BGR that waits for the tracker, in memory or in a file."""
@@ -42,7 +99,7 @@ class _Captured:
     file: Path
 
 
-class LiveSource(ImageSource):
+class LiveSource(StoredFrames):
     """A source that is still recording. The n-th delivered frame is called `live_<n, six digits>`.
 
     A thread captures frames continuously. They wait for `arriving` in a `Backlog`, which leaves frames out evenly if
@@ -67,7 +124,11 @@ class LiveSource(ImageSource):
     ) -> None:
         if isinstance(stream, str) and stream.isdigit():
             stream = int(stream)
-        super().__init__(Path(_shown(stream)))
+        self._kept = None
+        if folder is None:
+            self._kept = tempfile.TemporaryDirectory(prefix="modp-ti-live-", ignore_cleanup_errors=True)
+            folder = Path(self._kept.name)
+        super().__init__(folder, path=Path(_shown(stream)))
         self._backlog: Backlog[_Captured] = Backlog(self._drop)
         self._held = 0  # bytes of the images that wait in memory
         self._changed = threading.Condition()
@@ -84,11 +145,6 @@ class LiveSource(ImageSource):
             self._capture.release()
             raise InputError(f"{self.path}: sends no frame (source.stream); is it in use by another program?")
         self._size = (first[1].shape[1], first[1].shape[0])
-        self._kept = None
-        if folder is None:
-            self._kept = tempfile.TemporaryDirectory(prefix="modp-ti-live-", ignore_cleanup_errors=True)
-            folder = Path(self._kept.name)
-        self._store = FrameStore(folder)
         self._add(*first)
         # A daemon, so that a stalled stream does not keep the process alive. `close` is registered with atexit because
         # Python would otherwise kill the thread inside the decoder at shutdown.
@@ -135,7 +191,7 @@ class LiveSource(ImageSource):
 
     @property
     def kept(self) -> dict[str, dict[str, str | None]]:
-        return kept_frames(self._store.folder)
+        return kept_frames(self.folder)
 
     @property
     def arrivals(self) -> Arrivals:
@@ -155,7 +211,7 @@ class LiveSource(ImageSource):
         last = self._last
         if last is not None and last[0] == name:
             return np.asarray(cv2.cvtColor(last[1], cv2.COLOR_BGR2RGB), dtype=np.uint8)
-        return self._store.read(name)
+        return super().read(name)
 
     def finish(self) -> None:
         """End the recording. Frames that have arrived are still delivered."""
@@ -219,9 +275,9 @@ class LiveSource(ImageSource):
 
     def _add(self, arrived: float, image: NDArray[np.uint8] | None) -> None:
         """Let a frame wait, on disk if there is no room in memory. Raises InputError if the disk is full."""
-        captured = _Captured(image, self._store.folder / f"waiting-{self._backlog.arrivals.arrived:06d}.png")
+        captured = _Captured(image, self.folder / f"waiting-{self._backlog.arrivals.arrived:06d}.png")
         if image is not None and self._held + image.nbytes > MEMORY:
-            self._store.write(captured.file, image)
+            self._write(captured.file, image)
             captured.image = None
         with self._changed:
             if self._ended:
@@ -263,11 +319,11 @@ class LiveSource(ImageSource):
     def _keep(self, arrived: float, captured: _Captured) -> None:
         """Store a frame under its number. Raises InputError if the disk is full."""
         number, time_taken = len(self._names), self._epoch + arrived
-        name, file = f"live_{number:06d}", self._store.file(number)
+        name, file = f"live_{number:06d}", self.file(number)
         if captured.image is None:
             os.replace(captured.file, file)
         else:
-            self._store.write(file, captured.image)
+            self._write(file, captured.image)
             self._last = name, captured.image  # the tracker reads it next, so it need not be decoded
         with suppress(OSError):  # on file systems that keep no such times
             os.utime(file, (time_taken, time_taken))  # for `list_frames`
@@ -316,9 +372,6 @@ def _open(stream: int | str):
     return capture
 
 
-# ---- the frames on disk --------------------------------------------------------------------------------------------
-
-
 def kept_frames(folder: Path) -> dict[str, dict[str, str | None]]:
     """Return the settings that read the delivered frames again, see `Tracker.kept`."""
     return {"source": {"stream": None, "path": str(folder), "kind": "tum_rgbd"}}
@@ -333,73 +386,3 @@ def list_frames(folder: Path) -> None:
         if header is not None and header.complete:  # the last one may be cut off
             lines.append(f"{file.stat().st_mtime_ns / 1e9!r} {file.name}\n")
     (folder / "rgb.txt").write_text("".join(lines), encoding="utf-8")
-
-
-class FrameStore:
-    """Frames of a live source by number, as PNG files.
-
-    Args:
-        folder: The folder, which exists.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-
-    def file(self, number: int) -> Path:
-        """Place of the n-th delivered frame."""
-        return self.folder / f"{number:06d}.png"
-
-    def write(self, file: Path, image: NDArray[np.uint8]) -> None:
-        """Store a frame (H, W, 3) BGR in one of these files.
-
-        Raises:
-            InputError: If it cannot be written, or would leave too little of the disk free.
-        """
-        import cv2
-
-        # Huffman coding of differences to the left takes half the time of OpenCV's default for the same size.
-        how = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY]
-        if hasattr(cv2, "IMWRITE_PNG_FILTER"):  # since OpenCV 4.11
-            how += [cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB]
-        _, data = cv2.imencode(".png", image, how)
-        try:
-            if not has_room(self.folder, len(data)):
-                raise InputError(
-                    f"{self.folder.parent}: less than 1 GiB is free for the frames of the live source; make room, or "
-                    "set TMPDIR to a folder that has some"
-                )
-            file.write_bytes(data.data)
-        except OSError as error:
-            file.unlink(missing_ok=True)
-            raise InputError(
-                f"{self.folder}: frames of the live source cannot be kept there: {error.strerror}; "
-                "make room, or set TMPDIR to a folder that has some"
-            ) from None
-
-    def read(self, name: str) -> NDArray[np.uint8]:
-        """Read a delivered frame (H, W, 3) uint8 RGB.
-
-        Raises:
-            InputError: If the file is missing or damaged.
-        """
-        file = self.file(int(name.rpartition("_")[2]))
-        image = decoded(file.read_bytes()) if file.is_file() else None
-        if image is None:
-            raise InputError(f"{file}: the frame that was kept there is gone or damaged: leave the folder alone")
-        return image
-
-
-class StoredFrames(ImageSource):
-    """The stored frames of a recording that has ended, for a process that did not record it.
-
-    Args:
-        folder: The folder of a `FrameStore`.
-        names: Names of the frames, in order.
-    """
-
-    def __init__(self, folder: Path, names: Sequence[str]) -> None:
-        super().__init__(folder, names, [0.0] * len(names))
-        self._store = FrameStore(folder)
-
-    def read(self, name: str) -> NDArray[np.uint8]:
-        return self._store.read(name)

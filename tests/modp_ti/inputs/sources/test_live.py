@@ -110,13 +110,11 @@ def test_frames_that_nobody_takes_wait_on_disk_beyond_a_limit_of_memory(camera, 
     camera.end()
     source = opened()
     wait_until(lambda: not source._thread.is_alive())
-    assert sorted(file.name for file in source._store.folder.iterdir()) == [
-        f"waiting-{i:06d}.png" for i in range(3, 20)
-    ]
+    assert sorted(file.name for file in source.folder.iterdir()) == [f"waiting-{i:06d}.png" for i in range(3, 20)]
     names = list(source.arriving(0, None, 1))
     assert numbers(source, names) == list(range(20))
     assert source._held == 0
-    assert sorted(file.name for file in source._store.folder.iterdir()) == [f"{i:06d}.png" for i in range(20)]
+    assert sorted(file.name for file in source.folder.iterdir()) == [f"{i:06d}.png" for i in range(20)]
 
 
 def test_a_slow_tracker_gets_thinned_frames_and_all_are_counted(camera, opened, monkeypatch):
@@ -133,7 +131,7 @@ def test_a_slow_tracker_gets_thinned_frames_and_all_are_counted(camera, opened, 
     assert len(taken) + source.arrivals.thinned == source.arrivals.arrived == 45
     assert len(taken) < 45 and taken == sorted(set(taken))
     assert source.notes[-2].startswith(f"{45 - len(taken)} of 45 frames of ")
-    assert len(list(source._store.folder.iterdir())) == len(taken)
+    assert len(list(source.folder.iterdir())) == len(taken)
 
 
 def test_a_pause_beyond_the_patience_ends_the_recording_and_is_told(camera, opened, monkeypatch):
