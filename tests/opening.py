@@ -1,10 +1,14 @@
-"""Opening of recordings in tests: trackers by their settings alone, and captures without their images."""
+"""Opening of recordings in tests: scenes in a folder, trackers by their settings, and captures without their images."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
+from modp_ti.config.scene_file import load_scene
 from modp_ti.config.settings import SceneConfig, SourceSettings
+from modp_ti.files.errors import InputError
 from modp_ti.files.file_tree import open_tree
 from modp_ti.inputs.capture import Capture
 from modp_ti.inputs.capture_reader import CaptureSettings
@@ -15,6 +19,21 @@ from modp_ti.inputs.readers import READERS, SOURCES
 from modp_ti.inputs.replay import ReplayedTracker
 
 CAPTURES = {kind: reader for kind, reader in READERS.items() if issubclass(reader, CaptureSettings)}
+
+
+def opened(folder: Path, *overrides: str) -> ReplayedTracker:
+    """The tracker of the folder's `scene.yaml`."""
+    tracker = open_tracker(load_scene(folder / "scene.yaml", list(overrides)))
+    assert isinstance(tracker, ReplayedTracker)
+    return tracker
+
+
+def refusal(folder: Path, *overrides: str) -> str:
+    """The one line that the user gets for the folder's `scene.yaml`."""
+    with pytest.raises(InputError) as caught:
+        opened(folder, *overrides)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
 
 
 def opened_with(

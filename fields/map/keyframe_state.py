@@ -75,7 +75,15 @@ class KeyframeRows:
         self._masks = np.split(arrays.get("transient", NO_MASK.ravel()), np.cumsum(self._mask_size.prod(axis=1))[:-1])
 
     def put(self, frame: TrackedFrame, store: KeyframeStore) -> None:
-        """Append the next keyframe, from its frame. Raises ValueError if the frame is not that of the next row."""
+        """Restore the next keyframe from its frame.
+
+        Args:
+            frame: Frame of the next row.
+            store: Store that the keyframe is appended to.
+
+        Raises:
+            ValueError: If `frame` is not the frame of the next row.
+        """
         row = len(store)
         if self.rows.get(frame.index) != row:
             raise ValueError(f"frame {frame.index} is not keyframe {row}")

@@ -126,7 +126,12 @@ class KeyframeStore:
         return (first, *(o for o in others if min(o.camera.width, o.camera.height) >= self.min_side))
 
     def append(self, frame: TrackedFrame, is_between: bool = False) -> Keyframe:
-        """Add a frame as a keyframe, or as one between. Its error starts at the mean of the others, the first at 1."""
+        """Add a frame as a keyframe. Its error starts at the mean of the others (1 for the first keyframe).
+
+        Args:
+            frame: The frame.
+            is_between: Whether it is a frame between keyframes.
+        """
         self.trajectory.add(frame)
         self.views = frame.views
         keyframe = self.view(frame, self.levels)
@@ -156,10 +161,14 @@ class KeyframeStore:
         self.nbytes += keyframe.nbytes
 
     def move_to_disk(self, keyframes: Sequence[Keyframe], stored: Callable[[list[NDArray]], list[NDArray]]) -> None:
-        """Replace the images of keyframes of the store, and their points, by the arrays that `stored` returns for them.
+        """Replace the images of keyframes of the store, and their points, by memory-mapped ones.
 
         Images that lie on disk already stay there. Points count in `nbytes` all the same, since a correction brings
         them back.
+
+        Args:
+            keyframes: The keyframes.
+            stored: Returns such arrays for arrays, in order.
         """
         going = [keyframe for keyframe in keyframes if keyframe.image_bytes > 0]
         if not going:
@@ -193,9 +202,13 @@ class KeyframeStore:
             self._depths.add(keyframe.median_depth)
 
     def view(self, frame: TrackedFrame, levels: int = 1) -> Keyframe:
-        """Return a frame as a keyframe with so many pyramid levels, without adding it to the store.
+        """Return a frame as a keyframe, without adding it to the store.
 
         Pose and exposure are interpolated between the surrounding keyframes, see `corrected` and `exposure_at`.
+
+        Args:
+            frame: The frame.
+            levels: Number of pyramid levels.
         """
         return Keyframe(
             index=frame.index,
@@ -212,10 +225,17 @@ class KeyframeStore:
         )
 
     def corrected(self, index: int, T_tracked: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Apply the refinement of the surrounding keyframes to a tracked pose T_camera_world (4, 4) (Section 3.3.3).
+        """Apply the refinement of the surrounding keyframes to a tracked pose (Section 3.3.3).
 
         The correction is interpolated by frame index between the keyframes of the same view before and after the frame.
         Outside the range of the keyframes, that of the nearest one is used. A view without keyframes stays as tracked.
+
+        Args:
+            index: Index of the frame.
+            T_tracked: Tracked pose T_camera_world (4, 4).
+
+        Returns:
+            Corrected pose T_camera_world (4, 4).
         """
         if not self._keyframes:
             return np.array(T_tracked, dtype=np.float64)

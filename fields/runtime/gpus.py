@@ -89,9 +89,14 @@ def _describe(vulkan: ctypes.CDLL, index: int, handle: int) -> VulkanDevice:
 
 
 def choose(devices: Sequence[VulkanDevice], asked: str | None = None) -> VulkanDevice | None:
-    """Return the device with the asked index, else a discrete GPU before an integrated one, a software driver last.
+    """Choose a device: a discrete GPU before an integrated one, and a software driver last.
 
-    Returns None if there is no device.
+    Args:
+        devices: The devices of the machine.
+        asked: Index of the device to choose instead; without effect if there is no such device.
+
+    Returns:
+        The device; None if there is none.
     """
     for device in devices:
         if str(device.index) == asked:

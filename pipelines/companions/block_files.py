@@ -43,7 +43,11 @@ class StoredBlock:
 
 
 def records_of(state: dict[str, NDArray]) -> NDArray[np.void]:
-    """Return records (N,) with a field for each entry of `GaussianField.to_numpy` and `history`, in order."""
+    """Return Gaussians as an array (N,) of records, with a field for each entry of their state, in order.
+
+    Args:
+        state: The entries of `GaussianField.to_numpy` and `history`.
+    """
     fields = [(name, array.dtype, array.shape[1:]) for name, array in state.items()]
     records = np.zeros(len(state["opacity_logit"]), dtype=fields)
     for name, array in state.items():
@@ -150,9 +154,13 @@ class BlockFiles:
         return stored
 
     def joined(self, count: int, parts: Iterable[Mapping[str, NDArray]]) -> dict[str, NDArray]:
-        """Join arrays of `count` rows that come in parts in a file, and return them memory-mapped.
+        """Join arrays that come in parts in a file, and return them memory-mapped. Raises OSError as `write` does.
 
-        The file goes with the arrays; on Windows, with the folder. Raises OSError as `write` does.
+        The file goes with the arrays; on Windows, with the folder.
+
+        Args:
+            count: Length of the joined arrays.
+            parts: Arrays by name, at least one of them.
         """
         following = iter(parts)
         first = next(following)

@@ -143,7 +143,12 @@ class Changes:
         return np.concatenate(found)
 
     def seen_by(self, now: CoarseView, then: CoarseView) -> NDArray[np.bool_]:
-        """Return where (h, w) a view of the earlier visit, compared with the maps of both visits, shows a change."""
+        """Return where (h, w) a view of the earlier visit shows what has changed.
+
+        Args:
+            now: The view compared with the present map.
+            then: The same view compared with the map of the earlier visit.
+        """
         found = np.zeros(then.depth.shape, dtype=bool)
         for view, voters in ((then, self._gone), (replace(then, depth=now.depth), self._new)):
             cells = then.valid & (view.depth > 0) & (then.difference < then.wrong)

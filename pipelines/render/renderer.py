@@ -237,7 +237,12 @@ class Renderer:
         self.develop(None, None)
 
     def develop(self, exposure: np.ndarray | None, vignette: np.ndarray | None) -> None:
-        """Apply an exposure (A, b) (3, 4) and a vignette (H, W, 3) to the rendered image, each possibly None."""
+        """Apply exposure and vignette to the rendered image.
+
+        Args:
+            exposure: Exposure (A, b) (3, 4); None for the identity.
+            vignette: Vignette (H, W, 3); None for no vignetting.
+        """
         self.photometric.forward(exposure, vignette)
 
     def backward(

@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from modp_ti.inputs.tracker_server import messages
-from tests.bags import START, Messages
+from tests.samples.bags import START, Messages
 
 NODE = runpy.run_path(str(Path(__file__).resolve().parents[2] / "docs" / "examples" / "ros2_node.py"))
 K = np.array([[60.0, 0, 50.5], [0, 62.0, 36.5], [0, 0, 1]])

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 from modp_ti.commands.app import app
-from tests.fault_injection.samples import SAMPLES, write_sample
+from tests.samples.kinds import SAMPLES, write_sample
 
 Corruption = Callable[[Path], object]
 
-CASES = [(kind, file) for kind, (sample, _) in SAMPLES.items() for file in sample.files]
+CASES = [(kind, file) for kind, sample in SAMPLES.items() for file in sample.files]
 NUMBERS = ("nan", "inf", "1e300", "9" * 5000, "one")  # in place of a number
 # A number in a table or in JSON, but not a part of a name or of a word.
 NUMBER = re.compile(rb"(?<![\w./-])-?\d+(?:\.\d+)?(?:e-?\d+)?(?![\w./:-])")

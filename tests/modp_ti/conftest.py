@@ -9,15 +9,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from fields.geometry.camera import PinholeCamera
 from tests.modp_ti.runs import SHORT_RUN, finished_run
+from tests.samples.filmed import film
+from tests.samples.trackers import write_images
 
 if TYPE_CHECKING:
     from tests.room import RoomRecording
@@ -77,39 +77,10 @@ class PlaneScene:
 @pytest.fixture
 def plane_scene(tmp_path: Path) -> PlaneScene:
     """Seven views, 320x240, of a plane with blobs of many sizes, from an arc of 25 degrees at distance 4."""
-    rng = np.random.default_rng(7)
-    texture = np.zeros((800, 1000, 3), np.float32)
-    for size in (4, 8, 16, 40):
-        noise = rng.random((800 // size + 2, 1000 // size + 2, 3)).astype(np.float32)
-        texture += cv2.resize(noise, (1000, 800), interpolation=cv2.INTER_CUBIC)
-    texture = np.clip(255 * (texture - texture.min()) / np.ptp(texture), 0, 255).astype(np.uint8)
-
-    width, height = 320, 240
-    K = np.array([[300.0, 0, 161.3], [0, 298.0, 118.6], [0, 0, 1]])
-    metres_per_texel = 0.006
-    world_texture = np.array(  # texel with centre at +0.5 -> point of the plane, homogeneous
-        [
-            [metres_per_texel, 0, -500 * metres_per_texel],
-            [0, metres_per_texel, -400 * metres_per_texel],
-            [0, 0, 1],
-        ]
-    )
-    folder = tmp_path / "images"
-    folder.mkdir()
-    names, poses = [], []
-    half = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])  # to cv2's integer centres
-    for i, angle in enumerate(np.linspace(-12.5, 12.5, 7)):
-        R = Rotation.from_euler("yxz", [angle, 0.2 * angle, 3 * np.sin(i)], degrees=True).as_matrix()
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = R, R @ [0.0, 0.0, 4.0 + 0.1 * i] + [0.05 * i, 0, 0]
-        homography = K @ T[:3, [0, 1, 3]] @ world_texture
-        image = cv2.warpPerspective(
-            texture, half @ homography @ np.linalg.inv(half), (width, height), flags=cv2.INTER_AREA
-        )
-        names.append(f"view{i + 8}.png")  # view8 ... view14: not in the order of the alphabet
-        cv2.imwrite(str(folder / names[-1]), image)
-        poses.append(T)
-    return PlaneScene(folder, names, K, np.stack(poses), (width, height))
+    filmed = film(7, (320, 240), [f"view{i}.png" for i in range(8, 15)])  # not in the order of the alphabet
+    write_images(tmp_path, filmed)
+    poses = np.stack([view.T_camera_world for view in filmed.views])
+    return PlaneScene(tmp_path / "images", list(filmed.names), filmed.K, poses, filmed.size)
 
 
 @pytest.fixture(scope="session")

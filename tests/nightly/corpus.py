@@ -1,7 +1,7 @@
 """Every file of the corpus is taken, or refused with an InputError: what the fuzzer found, and what hands have damaged.
 
 The corpus is `corpus.tar.xz`, whose members are called KIND/FILE/HASH: the content of one file of a sample of that kind
-(`tests/fault_injection/samples.py`), with `|` for `/` in the file's name.
+(`tests/samples/kinds.py`), with `|` for `/` in the file's name.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ import pytest
 from modp_ti.config.scene_file import load_scene
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.opening import open_tracker
-from tests.fault_injection.samples import SAMPLES, write_sample
 from tests.modp_ti.inputs.tracker_server.clients import END, FRAME, HELLO, connect, frame, hello, message, opened
+from tests.samples.kinds import SAMPLES, write_sample
 
 ARCHIVE = Path(__file__).with_name("corpus.tar.xz")
 ALONE = {"weights": ("weights.pth", "older.pth"), "tracker_server": ("wire",)}
 """Files of kinds that have no sample."""
-FILES = {kind: sample.files for kind, (sample, _) in SAMPLES.items()} | ALONE
+FILES = {kind: sample.files for kind, sample in SAMPLES.items()} | ALONE
 
 Content = tuple[str, bytes]  # the file's name in the sample's folder, and its content
 

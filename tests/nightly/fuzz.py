@@ -20,8 +20,8 @@ from typing import NoReturn
 import atheris
 
 with atheris.instrument_imports(include=["modp_ti"]):
-    from tests.fault_injection.samples import write_sample
     from tests.nightly.corpus import ALONE, FILES, add_to_corpus, corpus, is_taken
+    from tests.samples.kinds import write_sample
 
 TIMEOUT = 20  # seconds for one input
 LONGEST = 1 << 14  # bytes of an input

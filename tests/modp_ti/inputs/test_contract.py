@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -9,51 +10,65 @@ import numpy as np
 import pytest
 
 from fields.frames.origin import far_origin, shifted
-from fields.geometry.se3 import camera_centres
-from modp_ti.config.scene_file import load_scene
+from modp_ti.config.keys import variants_of
+from modp_ti.config.settings import SceneConfig
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.opening import open_tracker
-from modp_ti.inputs.replay import ReplayedTracker
-from tests.fault_injection import samples, small_bag, small_recording, tracker_samples
-from tests.fault_injection.samples import CAPTURES, SAMPLES, write_sample
-from tests.fault_injection.small_recording import FRAMES, NAMES
+from modp_ti.inputs.bare_recording import recorded_scene
+from modp_ti.inputs.opening import open_source, open_tracker, recognised_kind
+from modp_ti.inputs.readers import READERS
+from tests.opening import CAPTURES, opened
+from tests.samples.captures import WRITERS, zipped
+from tests.samples.kinds import FRAMES, SAMPLES, SIZE, SMALL, write_sample
 
-TRACKERS = ("colmap_text", "colmap", "transforms", "tum", "ply", "orbslam3", "tum_rgbd", "replica", "matrices")
-TRACKERS += ("tanksandtemples", "sevenscenes", "modp", "aria", "stella_vslam", "video")
-KINDS = (*TRACKERS, *CAPTURES, *(name for name in SAMPLES if name.startswith("bag_")))
-# Their files hold coordinates as float32, which are lost far from the origin, or times that a change of place changes.
-NEAR_ALONE = ("transforms", "ply", "modp", "stray_scanner")
+KINDS = [kind for kind, sample in SAMPLES.items() if sample.is_tracker]
+# Kinds whose files hold neither points nor depths, so that so small pictures give none.
+WITHOUT_POINTS = ("nerfcapture", "euroc", "kitti")
+# Their files hold coordinates as float32, which are lost far from the origin.
+NEAR_ALONE = ("transforms", "ply", "modp", *(kind for kind in KINDS if kind.startswith("bag_")))
 BY_NAMES = ("colmap_text", "colmap", "transforms", "modp")
+TEXTS = ("tum", "orbslam3", "matrices", "tanksandtemples", "replica", "sevenscenes", "modp", "colmap_text", "euroc")
 FAR = 452_000.0
 
 
-def opened(folder: Path, *overrides: str) -> ReplayedTracker:
-    tracker = open_tracker(load_scene(folder / "scene.yaml", list(overrides)))
-    assert isinstance(tracker, ReplayedTracker)
-    return tracker
-
-
-def written(kind: str, folder: Path) -> Path:
+def written(kind: str, folder: Path, filmed=SMALL) -> Path:
     if kind == "record3d":
-        pytest.importorskip("liblzfse")
-    write_sample(kind, folder)
+        pytest.importorskip("lzfse")
+    write_sample(kind, folder, filmed)
     return folder
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_poses_are_world_to_camera_and_points_lie_on_their_pixels(kind: str, tmp_path: Path) -> None:
-    frames = list(opened(written(kind, tmp_path / "a")))
-    assert len(frames) == FRAMES
-    centres = camera_centres([frame.T_camera_world for frame in frames])
-    np.testing.assert_allclose(centres - centres[0], [[0.1 * i, 0, 0] for i in range(FRAMES)], atol=1e-5)
-    for frame in frames:
+def every(kinds) -> pytest.MarkDecorator:
+    return pytest.mark.parametrize("kind", kinds)
+
+
+def assert_frames(frames, filmed=SMALL, atol: float = 1e-6) -> None:
+    """The frames have the poses of the views, and points on the plane and on their pixels."""
+    for frame, view in zip(frames, filmed.views, strict=True):
+        np.testing.assert_allclose(frame.T_camera_world, view.T_camera_world, atol=atol)
         p = frame.points.xyz @ frame.T_camera_world[:3, :3].T + frame.T_camera_world[:3, 3]
-        if len(p):  # without depth maps or a map, so small pictures give none
+        if len(p):
             assert (p[:, 2] > 0).all()
-            assert np.linalg.norm(frame.camera.project(p) - frame.points.pixels, axis=1).max() < 0.6
+            assert np.linalg.norm(frame.camera.project(p) - frame.points.pixels, axis=1).max() < 0.1
+            assert np.median(np.abs(frame.points.xyz[:, 2])) < 2e-3  # depths are rounded to a millimetre
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@every(KINDS)
+def test_poses_cameras_points_and_images_are_those_that_were_filmed(kind: str, tmp_path: Path) -> None:
+    tracker = opened(written(kind, tmp_path / "a"))
+    frames = list(tracker)
+    assert_frames(frames)
+    assert (np.diff([frame.timestamp for frame in frames]) > 0).all()
+    for frame, posed, view in zip(frames, tracker.frames, SMALL.views, strict=True):
+        np.testing.assert_allclose(posed.undistorter.raw.matrix(), view.K, atol=1e-6)
+        expected = view.image[..., 1] / 255.0  # green: bags are grey
+        assert np.abs(frame.image[..., 1] - expected).mean() < 0.05  # JPEG and videos are packed with loss
+        assert len(frame.points) >= (0 if kind in WITHOUT_POINTS else 15)
+        assert len(np.unique(frame.points.ids)) == len(frame.points)
+    for frame, same in zip(frames, opened(tmp_path / "a"), strict=True):
+        np.testing.assert_array_equal(frame.points.xyz, same.points.xyz)
+
+
+@every(KINDS)
 def test_held_out_images_change_no_other_frame(kind: str, tmp_path: Path) -> None:
     folder = written(kind, tmp_path / "a")
     first = opened(folder, "source.holdout=2")
@@ -62,37 +77,28 @@ def test_held_out_images_change_no_other_frame(kind: str, tmp_path: Path) -> Non
     image = next(iter(folder.rglob(first.frames[0].name)), None)
     if image is None:
         return  # a bag, an archive or a video
-    cv2.imwrite(str(image), np.random.default_rng(1).integers(0, 255, (*before[0].image.shape,), np.uint8))
+    cv2.imwrite(str(image), np.random.default_rng(1).integers(0, 255, (*SIZE[::-1], 3), np.uint8))
     for frame, same in zip(before[1::2], list(opened(folder, "source.holdout=2"))[1::2], strict=True):
         np.testing.assert_array_equal(frame.image, same.image)
         np.testing.assert_array_equal(frame.T_camera_world, same.T_camera_world)
         np.testing.assert_array_equal(frame.points.xyz, same.points.xyz)
 
 
-@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind not in NEAR_ALONE and not kind.startswith("bag_")])
-def test_far_from_the_origin_the_frames_are_the_same_near_it(
-    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@every(kind for kind in KINDS if kind not in NEAR_ALONE)
+def test_far_from_the_origin_the_frames_are_the_same_near_it(kind: str, tmp_path: Path) -> None:
     near = list(opened(written(kind, tmp_path / "near")))
-    place, wall = small_recording.position, small_recording.wall()
-    for module in (samples, small_bag, small_recording, tracker_samples):
-        monkeypatch.setattr(module, "position", lambda i: FAR + place(i))
-        monkeypatch.setattr(module, "wall", lambda: wall + np.array([FAR, 0.0, 0.0]))
-    far = list(opened(written(kind, tmp_path / "far")))
+    far = list(opened(written(kind, tmp_path / "far", SMALL.moved((FAR, 0.0, 0.0)))))
     origin = far_origin(far[0].T_camera_world, far[0].points)
     assert np.linalg.norm(origin) == pytest.approx(FAR, rel=1e-3)
     for a, b in zip(near, (shifted(frame, -origin) for frame in far), strict=True):
         moved = b.T_camera_world[:3, 3] - a.T_camera_world[:3, 3]
         assert np.abs(moved).max() < 200.0, "float32 has digits left for a hundredth of a pixel"
-        np.testing.assert_allclose(
-            b.points.depths(b.T_camera_world), a.points.depths(a.T_camera_world), atol=1e-5, err_msg=kind
-        )
+        np.testing.assert_allclose(b.points.depths(b.T_camera_world), a.points.depths(a.T_camera_world), atol=1e-5)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@every(KINDS)
 def test_what_is_missing_is_one_line_that_names_it(kind: str, tmp_path: Path) -> None:
-    sample = SAMPLES[kind][0]
-    for number, name in enumerate(sample.files):
+    for number, name in enumerate(SAMPLES[kind].files):
         folder = written(kind, tmp_path / str(number))
         (folder / name).unlink()
         try:
@@ -103,33 +109,87 @@ def test_what_is_missing_is_one_line_that_names_it(kind: str, tmp_path: Path) ->
             assert notes, f"{name} is missing and nothing is said"
 
 
-@pytest.mark.parametrize("kind", BY_NAMES)
-@pytest.mark.parametrize("other", [str.upper, lambda name: name.replace(".png", ".jpg")], ids=["case", "suffix"])
-def test_names_in_another_writing_are_found_with_a_note(kind: str, other, tmp_path: Path) -> None:
+@every(KINDS)
+def test_frames_without_a_pose_and_poses_without_an_image_are_counted(kind: str, tmp_path: Path) -> None:
     folder = written(kind, tmp_path / "a")
     expected = opened(folder)
-    for name in NAMES:
+    image = next(iter(folder.rglob(expected.frames[1].name)), None)
+    if image is None:
+        return  # a bag, an archive or a video
+    image.unlink()
+    found = opened(folder)
+    if kind in ("matrices", "tanksandtemples", "tum", "ply", "orbslam3", "kitti", "stella_vslam", "aria"):
+        assert len(found.frames) == FRAMES - 1, "which images have which pose is by their places and times"
+        return
+    assert [frame.name for frame in found.frames] == [expected.frames[i].name for i in (0, 2)]
+    np.testing.assert_allclose(found.frames[1].T_camera_world, expected.frames[2].T_camera_world)
+
+
+@every(BY_NAMES)
+@pytest.mark.parametrize("other", [str.upper, lambda name: name.replace(".png", ".jpg")], ids=["case", "suffix"])
+def test_names_in_another_writing_are_found_with_a_note(kind: str, other: Callable[[str], str], tmp_path: Path) -> None:
+    folder = written(kind, tmp_path / "a")
+    for name in SMALL.names:
         file = next(folder.rglob(name))
         if other(name).endswith(".jpg"):
-            cv2.imwrite(str(file.with_name(other(name))), cv2.imread(str(file)))
+            cv2.imwrite(str(file.with_name(other(name))), np.asarray(cv2.imread(str(file))))
             file.unlink()
         else:
             file.rename(file.with_name(other(name)))
     found = opened(folder)
-    assert len(found.frames) == len(expected.frames)
-    assert any(other(name) in note for name in NAMES for note in found.notes)
-    for a, b in zip(expected.frames, found.frames, strict=True):
-        np.testing.assert_array_equal(a.T_camera_world, b.T_camera_world)
+    assert any(other(name) in note for name in SMALL.names for note in found.notes)
+    assert_frames(found)
 
 
-@pytest.mark.parametrize("kind", ("tum", "orbslam3", "matrices", "tanksandtemples", "replica", "sevenscenes", "modp"))
+@every(TEXTS)
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
 def test_text_has_any_byte_order_mark(kind: str, encoding: str, tmp_path: Path) -> None:
     folder = written(kind, tmp_path / "a")
-    expected = list(opened(folder))
     for file in folder.rglob("*"):
-        if file.suffix in (".txt", ".log", ".json", ".yaml"):
+        if file.suffix in (".txt", ".log", ".json", ".yaml", ".csv"):
             file.write_text(file.read_text(), encoding=encoding)
-    for a, b in zip(expected, opened(folder), strict=True):
-        np.testing.assert_array_equal(a.T_camera_world, b.T_camera_world)
+    assert_frames(opened(folder))
+
+
+@every(CAPTURES)
+def test_a_capture_alone_is_recognised_and_tracked_by_its_own_poses(kind: str, tmp_path: Path) -> None:
+    """It may lie in the only folder of a folder."""
+    WRITERS[kind](tmp_path / "42/42_frames", SMALL.views)
+    for folder in (tmp_path / "42/42_frames", tmp_path / "42"):
+        assert recognised_kind(folder) == kind
+        assert recorded_scene(folder).tracker.kind == kind
+    assert recorded_scene(tmp_path / "42", ["tracker.kind=klt"]).tracker.kind == "klt"
+    images = open_source(recorded_scene(tmp_path / "42").source)
+    assert images.intrinsics is not None and len(images) == FRAMES
+    np.testing.assert_allclose(images.intrinsics.camera.matrix(), SMALL.K, atol=1e-6)
+
+
+@every(["polycam", "nerfcapture", "scanner_app"])
+@pytest.mark.parametrize("top", ["", "capture"])
+def test_an_archive_is_the_same_as_its_folder(kind: str, top: str, tmp_path: Path) -> None:
+    """What macOS adds to archives is left out."""
+    WRITERS[kind](tmp_path / "folder", SMALL.views)
+    (tmp_path / "folder/__MACOSX").mkdir()
+    (tmp_path / "folder/__MACOSX/._1700000.json").write_text("x")
+    config = recorded_scene(zipped(tmp_path / "folder", tmp_path / "room.zip", top))
+    assert (config.tracker.kind, config.output.name) == (kind, "room")
+    packed, unpacked = open_tracker(config), open_tracker(recorded_scene(tmp_path / "folder"))
+    for a, b in zip(packed, unpacked, strict=True):
+        assert a.name == b.name
+        np.testing.assert_array_equal(a.image, b.image)
         np.testing.assert_array_equal(a.points.xyz, b.points.xyz)
+
+
+@every(variants_of(SceneConfig.model_fields["tracker"]))
+def test_every_kind_of_a_scene_is_opened_and_names_what_is_missing(kind: str, tmp_path: Path) -> None:
+    source = {} if kind == "socket" else {"path": tmp_path / "gone"}
+    tracker = {"kind": kind, **({"path": tmp_path / "gone" / "socket"} if kind == "socket" else {})}
+    config = SceneConfig.model_validate({"source": source, "tracker": tracker, "output": tmp_path / "out"})
+    with pytest.raises(InputError) as caught:
+        open_tracker(config)
+    assert str(tmp_path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_there_is_a_sample_of_every_kind_that_reads_files() -> None:
+    assert set(READERS) - {"klt", "sfm", "socket", "bag"} <= set(SAMPLES), "bags have a sample for each form"
+    assert set(CAPTURES) == set(WRITERS)

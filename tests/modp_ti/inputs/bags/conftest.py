@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from modp_ti.config.settings import SceneConfig
 from modp_ti.inputs.opening import open_tracker
 from modp_ti.inputs.replay import ReplayedTracker
-from tests.captures import View
+from tests.samples.filmed import View
 
 Opened = Callable[..., ReplayedTracker]
 

@@ -17,7 +17,7 @@ from modp_ti.inputs import posed_recording
 from modp_ti.inputs.bags import has_poses, is_bag
 from modp_ti.inputs.bare_recording import recorded_scene
 from modp_ti.inputs.opening import open_source
-from tests.bags import BODY_CAMERA, FORMS, START, STEP, Messages, recording, write_bag
+from tests.samples.bags import BODY_CAMERA, FORMS, START, STEP, Messages, recording, write_bag
 
 PLANE = np.stack(np.meshgrid(np.linspace(-3, 3, 40), np.linspace(-3, 3, 40), [0.0]), axis=-1).reshape(-1, 3)
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from modp_ti.inputs.bags.messages import depth_metres
-from tests.bags import START, STEP, Messages, recording, write_bag
+from tests.samples.bags import START, STEP, Messages, recording, write_bag
 
 MAKE = Messages()
 METRES = np.array([[0.0, 0.5, 1.25], [2.0, 4.0, 0.0]], np.float32)

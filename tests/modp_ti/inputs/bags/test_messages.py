@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.bags.messages import camera_of_info, cloud_points, picture, picture_size
 from modp_ti.inputs.bags.transforms import FrameTree, Motion
-from tests.bags import START, Messages
+from tests.samples.bags import START, Messages
 
 MAKE, MAKE_ROS1 = Messages(), Messages("ros1")
 RGB = np.random.default_rng(0).integers(0, 255, (6, 8, 3)).astype(np.uint8)

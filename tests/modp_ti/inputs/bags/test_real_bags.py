@@ -8,7 +8,7 @@ import pytest
 from modp_ti.inputs.bags import Bag
 from modp_ti.inputs.bags.bag import CLOUD, IMAGES, INFO
 from modp_ti.inputs.bags.transforms import read_frame_tree, read_pose_topic
-from tests.bags import OPTICAL
+from tests.samples.bags import OPTICAL
 
 pytestmark = pytest.mark.real_data
 

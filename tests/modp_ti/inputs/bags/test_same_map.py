@@ -16,7 +16,7 @@ from modp_ti.engine.mapper import Mapper
 from modp_ti.inputs.opening import open_tracker
 from modp_ti.inputs.protocol import Tracker
 from pipelines.settings import MappingSettings
-from tests.bags import START, STEP, Messages, recording, write_bag
+from tests.samples.bags import START, STEP, Messages, recording, write_bag
 
 pytestmark = pytest.mark.slow
 SETTINGS = MappingSettings.model_validate({"optimise": {"steps": 1}})

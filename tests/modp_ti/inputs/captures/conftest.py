@@ -1,39 +1,23 @@
-"""Views of the textured plane, and the opening of captures of them."""
+"""Opening of captures by their place and kind."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
 
-import cv2
-import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from modp_ti.config.settings import SceneConfig
 from modp_ti.inputs.opening import open_tracker
 from modp_ti.inputs.replay import ReplayedTracker
-from tests.captures import View
+from tests.samples.filmed import Filmed, View
 
 Opened = Callable[..., ReplayedTracker]
 
 
-def plane_depth(T_world_camera: NDArray, K: NDArray, size: tuple[int, int]) -> NDArray:
-    """Depths of the plane z = 0 of the world."""
-    columns, rows = np.meshgrid(np.arange(size[0]) + 0.5, np.arange(size[1]) + 0.5)
-    rays = np.stack([(columns - K[0, 2]) / K[0, 0], (rows - K[1, 2]) / K[1, 1], np.ones_like(rows)], axis=-1)
-    return -T_world_camera[2, 3] / (rays @ T_world_camera[2, :3])
-
-
 @pytest.fixture
-def views(plane_scene) -> list[View]:
-    """Seven views of the plane."""
-    result = []
-    for name, T in zip(plane_scene.names, plane_scene.T_camera_world, strict=True):
-        there = np.linalg.inv(T)
-        image = np.asarray(cv2.imread(str(plane_scene.folder / name)), np.uint8)
-        result.append(View(image, plane_scene.K, there, lambda K, size, there=there: plane_depth(there, K, size)))
-    return result
+def views(filmed: Filmed) -> list[View]:
+    return list(filmed.views)
 
 
 @pytest.fixture

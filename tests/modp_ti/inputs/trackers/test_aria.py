@@ -4,10 +4,20 @@ from __future__ import annotations
 
 import gzip
 import json
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+
+from modp_ti.config.settings import SceneConfig
+from modp_ti.files.errors import InputError
+from modp_ti.inputs.opening import open_tracker
+from modp_ti.inputs.protocol import Tracker
+from tests.samples.filmed import Filmed, write_text
+from tests.samples.trackers import write_images
 
 WORLD = "ea7288b8-b6a0-012d-8156-257aba6bd796"
 START = 149_202_610  # [us]
@@ -63,9 +73,50 @@ def point_rows(recording) -> list[str]:
     ]
 
 
+@dataclass(frozen=True)
+class Recording:
+    """A folder with the images of what was filmed, and its points (P, 3)."""
+
+    root: Path
+    filmed: Filmed
+    xyz: np.ndarray
+
+    @property
+    def poses_in_world(self) -> list[np.ndarray]:
+        return [view.T_world_camera for view in self.filmed.views]
+
+    def write(self, name: str, lines: list[str]) -> Path:
+        write_text(self.root / name, lines)
+        return self.root / name
+
+    def open(self, kind: str, source: dict | None = None, **tracker) -> Tracker:
+        K = self.filmed.K
+        intrinsics = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+        source = {"path": self.root / "images", "intrinsics": intrinsics, **(source or {})}
+        settings = {"source": source, "tracker": {"kind": kind, **tracker}, "output": Path("out")}
+        return open_tracker(SceneConfig.model_validate(settings))
+
+    def failure(self, kind: str, **tracker) -> str:
+        """The one line that the user gets."""
+        with pytest.raises(InputError) as caught:
+            self.open(kind, **tracker)
+        assert "\n" not in str(caught.value)
+        return str(caught.value)
+
+    def assert_frames(self, tracker: Tracker, numbers: Iterable[int], least_points: int = 20) -> None:
+        """The frames of these numbers, with their poses, and points on their pixels."""
+        for frame, i in zip(tracker.frames, numbers, strict=True):
+            np.testing.assert_allclose(frame.T_camera_world, self.filmed.views[i].T_camera_world, atol=1e-6)
+            p = frame.points.xyz @ frame.T_camera_world[:3, :3].T + frame.T_camera_world[:3, 3]
+            np.testing.assert_allclose(frame.undistorter.camera.project(p), frame.points.pixels, atol=1e-3)
+            assert len(frame.points) >= least_points
+
+
 @pytest.fixture
-def recorded(recording):
+def recorded(filmed, tmp_path):
     """MPS's folder `slam` beside the images, with all but the observations."""
+    write_images(tmp_path, filmed)
+    recording = Recording(tmp_path, filmed, filmed.points)
     write_trajectory(recording, trajectory_rows(recording))
     wrong = MOUNT.copy()
     wrong[:3, 3] += 1.0
@@ -122,9 +173,8 @@ def test_open_loop_is_read_and_said_to_drift(recorded):
     file = recorded.root / "slam" / "open_loop_trajectory.csv"
     file.write_text(file.read_text().replace("graph_uid", "session_uid", 1))
     tracker = recorded.open("aria", {"stop": 3}, **CLOCK)
-    np.testing.assert_allclose(
-        [frame.T_camera_world for frame in tracker.frames], recorded.T_camera_world[:3], atol=1e-6
-    )
+    expected = [view.T_camera_world for view in recorded.filmed.views[:3]]
+    np.testing.assert_allclose([frame.T_camera_world for frame in tracker.frames], expected, atol=1e-6)
     assert any("odometry, which drifts" in note for note in tracker.notes)
 
 

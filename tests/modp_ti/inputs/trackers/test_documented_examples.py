@@ -2,30 +2,26 @@
 
 from __future__ import annotations
 
-import gzip
 import json
 import re
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
-from typer.testing import CliRunner
 
-from modp_ti.commands import app as cli
 from modp_ti.config.scene_file import load_scene
 from modp_ti.config.settings import SceneConfig
 from modp_ti.inputs.opening import open_tracker
-from tests.bags import recording as bag_messages
-from tests.bags import write_bag
-from tests.captures import WRITERS, View, zipped
 from tests.opening import CAPTURES
+from tests.samples.bags import recording as bag_messages
+from tests.samples.bags import write_bag
+from tests.samples.captures import WRITERS, zipped
+from tests.samples.filmed import write_image, write_text
+from tests.samples.kinds import write_sample
 
 PAGE = Path(__file__).resolve().parents[4] / "docs" / "trackers.md"
-SHARED = Path(__file__).resolve().parents[5] / "shared" / "data"
 
 
 def blocks() -> dict[str, list[str]]:
@@ -51,167 +47,100 @@ def test_every_reader_has_its_page():
     assert all(texts for texts in sections.values())
 
 
-def images(recording, folder: Path, size: tuple[int, int], names: Callable[[int], str]) -> None:
-    """The plane's views at another size, under other names."""
-    folder.mkdir(parents=True)
-    for i, name in enumerate(recording.names):
-        picture = cv2.imread(str(recording.root / "images" / name))
-        cv2.imwrite(str(folder / names(i)), cv2.resize(picture, size, interpolation=cv2.INTER_AREA))
+SHARED_DATA = {"tum": "rgbd_dataset_freiburg1_desk", "stella_vslam": "redkitchen", "sevenscenes": "redkitchen"}
+NAMES = {  # of the images, where the writers of samples have others or the section needs others
+    "orbslam3": lambda i: f"MH01/mav0/cam0/data/{1403636579763555584 + 50_000_000 * i}.png",
+    "modp": lambda i: f"hall/rectified/{i:04d}.png",
+    "replica": lambda i: f"room0/results/frame{i:06d}.jpg",
+    "matrices": lambda i: f"room/images/{i}.png",
+    "tanksandtemples": lambda i: f"Truck/images/{i + 1:06d}.jpg",
+    "aria": lambda i: f"rectified/{i:04d}.png",
+    "tum": lambda i: f"images/{i:04d}.png",
+}
+SIZES = {"orbslam3": (752, 480), "modp": (800, 800), "replica": (1200, 680), "tanksandtemples": (1957, 1091)}
+SIZES |= {"aria": (800, 800), "matrices": (640, 480), "tum": (640, 480)}
+
+
+def move(folder: Path, files: dict[str, str]) -> None:
+    for old, new in files.items():
+        (folder / new).parent.mkdir(parents=True, exist_ok=True)
+        (folder / old).rename(folder / new)
+
+
+# Where the files of a sample lie in the section's example, and which block it is.
+MOVED = {
+    "tum": ({"trajectory.txt": "trajectory.txt", "points.ply": "points.ply"}, 1),
+    "orbslam3": ({"CameraTrajectory.txt": "MH01/KeyFrameTrajectory.txt", "points.txt": "MH01/map_points.txt"}, 0),
+    "modp": ({"trajectory.json": "hall/trajectory.json", "point_cloud": "hall/point_cloud"}, 0),
+    "replica": ({"traj.txt": "room0/traj.txt"}, 0),
+    "matrices": ({"poses.txt": "room/poses.txt"}, 0),
+    "tanksandtemples": ({"scene.log": "Truck/Truck.log"}, 0),
+}
+
+
+@pytest.mark.parametrize("kind", MOVED)
+def test_the_example_reads_the_files_of_its_section(filmed, tmp_path, kind):
+    """The frames have the poses of the sample, and its points where the section has some."""
+    write_sample("ply" if kind == "tum" else kind, tmp_path / "a", filmed)
+    files, number = MOVED[kind]
+    for folder in ("images", "rectified", "results"):
+        shutil.rmtree(tmp_path / "a" / folder, ignore_errors=True)
+    move(tmp_path / "a", files)
+    for i, view in enumerate(filmed.views):
+        write_image(tmp_path / "a" / NAMES[kind](i), cv2.resize(view.image, SIZES[kind], interpolation=cv2.INTER_AREA))
+    if kind == "modp":
+        file = tmp_path / "a/hall/trajectory.json"
+        cameras = json.loads(file.read_text())["cameras"]
+        file.write_text(json.dumps({"cameras": [c | {"image": f"{i:04d}.png"} for i, c in enumerate(cameras)]}))
+    if kind == "orbslam3":  # its times are those of the images' names
+        file = tmp_path / "a/MH01/KeyFrameTrajectory.txt"
+        file.write_text(file.read_text().replace("\n1400000000", "\n1403636579").replace("1400000000", "1403636579", 1))
+        lines = [line.split(" ", 1)[1] for line in file.read_text().splitlines()]
+        write_text(file, [f"{1403636579763555584 + 50_000_000 * i}.0 {lines[i]}" for i in (0, 2, 5)])
+    expected = [filmed.views[i] for i in ((0, 2, 5) if kind == "orbslam3" else range(2))]
+    frames = delivered(tmp_path / "a", kind, number, *(() if kind == "orbslam3" else ("source.stop=2",)))
+    for frame, view in zip(frames, expected, strict=True):
+        np.testing.assert_allclose(frame.T_camera_world, view.T_camera_world, atol=1e-6)
+        assert len(frame.points) > 20 or kind in ("replica", "matrices", "tanksandtemples")
+
+
+@pytest.mark.parametrize("kind", SHARED_DATA)
+def test_the_example_reads_a_real_recording(shared_data, tmp_path, kind):
+    name = SHARED_DATA[kind]
+    (tmp_path / name).symlink_to(shared_data("tum_fr1_desk" if kind == "tum" else name))
+    frames = delivered(tmp_path, kind, 0, f"source.stop={40 if kind == 'stella_vslam' else 2}")
+    assert len(frames) == (14 if kind == "stella_vslam" else 2)  # frame 0 and those from 27 on
+
+
+@pytest.mark.parametrize("kind", CAPTURES)
+def test_the_example_reads_a_capture(filmed, tmp_path, kind):
+    path = load_example(tmp_path, kind).source.path
+    assert path is not None
+    WRITERS[kind](tmp_path / "unpacked", filmed.views[:2])
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.suffix:
+        zipped(tmp_path / "unpacked", path)
+    else:
+        (tmp_path / "unpacked").rename(path)
+    frames = delivered(tmp_path, kind, 0, "source.step=1")
+    for frame, view in zip(frames, filmed.views[:2], strict=True):
+        np.testing.assert_allclose(frame.T_camera_world, view.T_camera_world, atol=1e-6)
+
+
+@pytest.mark.parametrize("number", [0, 1])
+def test_the_example_reads_a_bag(filmed, tmp_path, number):
+    write_bag(tmp_path / "corridor.bag", "ros1", bag_messages(filmed.views[:2], "ros1"))
+    for frame, view in zip(delivered(tmp_path, "bag", number), filmed.views[:2], strict=True):
+        np.testing.assert_allclose(frame.T_camera_world, view.T_camera_world, atol=1e-9)
 
 
 def delivered(root: Path, kind: str, number: int = 0, *overrides: str) -> list:
     """All frames of the example, run in this folder."""
-    file = root / "scene.yaml"
-    file.write_text(blocks()[kind][number])
-    return list(open_tracker(load_scene(file, overrides)))
-
-
-def from_shared(root: Path, name: str, called: str) -> None:
-    if not (SHARED / name).is_dir():
-        pytest.skip(f"no ../shared/data/{name}")
-    (root / called).symlink_to(SHARED / name)
-
-
-def test_tum_benchmark(tmp_path):
-    from_shared(tmp_path, "tum_fr1_desk", "rgbd_dataset_freiburg1_desk")
-    frames = delivered(tmp_path, "tum", 0, "source.stop=2")
-    assert [frame.timestamp for frame in frames] == [1305031453.359684, 1305031453.391690]
-
-
-def test_tum_images_of_ones_own(recording):
-    images(recording, recording.root / "large", (640, 480), lambda i: f"{i:04d}.png")
-    shutil.rmtree(recording.root / "images")
-    (recording.root / "large").rename(recording.root / "images")
-    recording.write("trajectory.txt", recording.tum_lines())
-    header = ["ply", "format ascii 1.0", "element vertex 60", *(f"property float {axis}" for axis in "xyz")]
-    recording.write("points.ply", [*header, "end_header", *(" ".join(map(str, row)) for row in recording.xyz)])
-    frames = delivered(recording.root, "tum", 1)
-    assert len(frames) == 7 and all(len(frame.points) > 20 for frame in frames)
-
-
-def test_orbslam3(recording):
-    start = 1403636579763555584
-    images(recording, recording.root / "MH01/mav0/cam0/data", (752, 480), lambda i: f"{start + 50_000_000 * i}.png")
-    lines = [line.split(" ", 1)[1] for line in recording.tum_lines()]
-    keyframes = [f"{start + 50_000_000 * i}.000000 {lines[i]}" for i in (0, 2, 5)]
-    recording.write("MH01/KeyFrameTrajectory.txt", keyframes)
-    recording.write_points("MH01/map_points.txt")
-    frames = delivered(recording.root, "orbslam3")
-    assert [frame.name for frame in frames] == [f"{start + 50_000_000 * i}.png" for i in (0, 2, 5)]
-    assert all(len(frame.points) > 20 for frame in frames)
-
-
-def test_stella_vslam(tmp_path):
-    from_shared(tmp_path, "redkitchen", "redkitchen")
-    frames = delivered(tmp_path, "stella_vslam", 0, "source.stop=40")
-    assert len(frames) == 14  # frame 0 and those from 27 on
-    assert all(len(frame.points) >= 100 for frame in frames)
-
-
-def test_aria(recording):
-    """The second block; the first needs a recording of the glasses."""
-    images(recording, recording.root / "rectified", (800, 800), lambda i: f"{i:04d}.png")
-    axes = ",".join(f"{axis}_world_device" for axis in ("tx", "ty", "tz", "qx", "qy", "qz", "qw"))
-    rows = [f"graph_uid,tracking_timestamp_us,{axes}"]
-    for i, T in enumerate(recording.poses_in_world):
-        pose = [*T[:3, 3], *Rotation.from_matrix(T[:3, :3]).as_quat()]
-        rows.append(f"w,{149202610 + 100_000 * i}," + ",".join(f"{x:.9f}" for x in pose))
-    recording.write("mps/slam/closed_loop_trajectory.csv", rows)
-    mount = {"Translation": [0, 0, 0], "UnitQuaternion": [1, [0, 0, 0]]}
-    line = {"tracking_timestamp_us": 1, "CameraCalibrations": [{"Label": "camera-rgb", "T_Device_Camera": mount}]}
-    recording.write("mps/slam/online_calibration.jsonl", [json.dumps(line)])
-    rows = ["uid,graph_uid,px_world,py_world,pz_world,inv_dist_std,dist_std"]
-    rows += [f"{i},w,{x!r},{y!r},{z!r},0.001,0.01" for i, (x, y, z) in enumerate(recording.xyz.tolist())]
-    with gzip.open(recording.root / "mps/slam/semidense_points.csv.gz", "wt") as file:
-        file.write("\n".join(rows) + "\n")
-    frames = delivered(recording.root, "aria", 1)
-    assert len(frames) == 7 and all(len(frame.points) > 20 for frame in frames)
-
-
-def test_modp(recording):
-    images(recording, recording.root / "hall/rectified", (800, 800), lambda i: f"{i:04d}.png")
-    cameras = [{"T_camera_world": T.tolist(), "image": f"{i:04d}.png"} for i, T in enumerate(recording.T_camera_world)]
-    recording.write("hall/trajectory.json", [json.dumps({"cameras": cameras})])
-    for i in range(7):
-        recording.write_points(f"hall/point_cloud/point_cloud_{i}.txt")
-    frames = delivered(recording.root, "modp")
-    assert len(frames) == 7 and all(len(frame.points) > 20 for frame in frames)
-
-
-def test_replica(recording):
-    images(recording, recording.root / "room0/results", (1200, 680), lambda i: f"frame{i:06d}.jpg")
-    recording.write("room0/traj.txt", [" ".join(map(str, T.ravel())) for T in recording.poses_in_world])
-    frames = delivered(recording.root, "replica", 0, "source.stop=2")
-    np.testing.assert_allclose([frame.T_camera_world for frame in frames], recording.T_camera_world[:2], atol=1e-9)
-
-
-def test_sevenscenes(tmp_path):
-    from_shared(tmp_path, "redkitchen", "redkitchen")
-    assert len(delivered(tmp_path, "sevenscenes", 0, "source.stop=2")) == 2
-
-
-def test_matrices(recording):
-    images(recording, recording.root / "room/images", (640, 480), lambda i: f"{i}.png")
-    recording.write("room/poses.txt", [" ".join(map(str, T.ravel())) for T in recording.poses_in_world])
-    frames = delivered(recording.root, "matrices", 0, "source.stop=2")
-    np.testing.assert_allclose([frame.T_camera_world for frame in frames], recording.T_camera_world[:2], atol=1e-9)
-
-
-def test_tanksandtemples(recording):
-    images(recording, recording.root / "Truck/images", (1957, 1091), lambda i: f"{i + 1:06d}.jpg")
-    lines = []
-    for i, T in enumerate(recording.poses_in_world):
-        lines += [f"{i} {i} 0", *(" ".join(map(str, row)) for row in T)]
-    recording.write("Truck/Truck.log", lines)
-    frames = delivered(recording.root, "tanksandtemples", 0, "source.stop=2")
-    np.testing.assert_allclose([frame.T_camera_world for frame in frames], recording.T_camera_world[:2], atol=1e-9)
-
-
-@pytest.mark.parametrize("kind", CAPTURES)
-def test_captures(recording, kind):
-    views = []
-    for i in range(2):
-        picture = np.asarray(cv2.imread(str(recording.root / "images" / recording.names[i])), np.uint8)
-        far = lambda K, size: np.full(size[::-1], 3.0)  # noqa: E731
-        views.append(View(picture, recording.K, recording.poses_in_world[i], far))
-    path = load_example(recording.root, kind).source.path
-    assert path is not None
-    WRITERS[kind](recording.root / "unpacked", views)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if path.suffix:
-        zipped(recording.root / "unpacked", path)
-    else:
-        (recording.root / "unpacked").rename(path)
-    frames = delivered(recording.root, kind, 0, "source.step=1")
-    np.testing.assert_allclose([frame.T_camera_world for frame in frames], recording.T_camera_world[:2], atol=1e-6)
-
-
-@pytest.mark.parametrize("number", [0, 1])
-def test_bag(recording, number):
-    poses = zip(recording.names[:2], recording.poses_in_world, strict=False)
-    pictures = ((np.asarray(cv2.imread(str(recording.root / "images" / name)), np.uint8), T) for name, T in poses)
-    views = [View(picture, recording.K, T, lambda _, size: np.zeros(size[::-1])) for picture, T in pictures]
-    write_bag(recording.root / "corridor.bag", "ros1", bag_messages(views, "ros1"))
-    frames = delivered(recording.root, "bag", number)
-    np.testing.assert_allclose([frame.T_camera_world for frame in frames], recording.T_camera_world[:2], atol=1e-9)
+    (root / "scene.yaml").write_text(blocks()[kind][number])
+    return list(open_tracker(load_scene(root / "scene.yaml", overrides)))
 
 
 def load_example(root: Path, kind: str) -> SceneConfig:
     file = root / "scene.yaml"
     file.write_text(blocks()[kind][0])
     return load_scene(file)
-
-
-def test_what_is_wrong_is_one_line_and_exit_code_2(recording):
-    lines = recording.tum_lines()
-    recording.write("trajectory.txt", [lines[0], lines[1] + " 7"])
-    file = recording.root / "scene.yaml"
-    file.write_text(
-        "source: {path: images, intrinsics: {fx: 300}}\ntracker: {kind: tum, path: trajectory.txt}\n"
-        "output: out\ndevice: cpu\n"
-    )
-    result = CliRunner().invoke(cli.app, ["run", str(file), "--quiet"])
-    assert result.exit_code == 2
-    assert "trajectory.txt:2: holds 9 columns instead of 8" in result.stderr
-    assert result.stderr.count("\n") == 1 and result.stderr.startswith("error: ")
-    assert not (recording.root / "out").exists()

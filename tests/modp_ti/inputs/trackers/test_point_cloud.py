@@ -7,7 +7,7 @@ import pytest
 
 from fields.geometry.camera import PinholeCamera
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.point_cloud import read_ply_points, visible_points
+from modp_ti.inputs.point_cloud import read_ply_points, read_point_file, visible_points
 from modp_ti.inputs.sources import Undistorter
 
 XYZ = np.random.default_rng(0).normal(size=(20, 3)).astype(np.float32)
@@ -55,6 +55,45 @@ def test_file_without_positions_is_named(tmp_path):
 def test_points_that_are_not_finite_are_left_out(tmp_path):
     (tmp_path / "p.ply").write_bytes(ascii_file().replace(repr(float(XYZ[3, 1])).encode(), b"nan", 1))
     np.testing.assert_allclose(read_ply_points(tmp_path / "p.ply"), np.delete(XYZ, 3, axis=0), rtol=1e-6)
+
+
+def pcd(form: str) -> bytes:
+    head = "# .PCD v0.7\nVERSION 0.7\nFIELDS rgb x y z normal\nSIZE 4 4 4 4 4\nTYPE U F F F F\nCOUNT 1 1 1 1 3\n"
+    head += f"WIDTH {len(XYZ)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(XYZ)}\nDATA {form}\n"
+    if form == "ascii":
+        return (head + "".join(f"255 {x!r} {y!r} {z!r} 0 0 1\n" for x, y, z in XYZ.tolist())).encode()
+    table = np.zeros(len(XYZ), [("rgb", "<u4"), ("xyz", "<f4", 3), ("normal", "<f4", 3)])
+    table["xyz"] = XYZ
+    return head.encode() + table.tobytes()
+
+
+@pytest.mark.parametrize("form", ["ply", "pcd ascii", "pcd binary", "npy", "text"])
+def test_points_of_any_program_are_read_and_those_with_nan_left_out(tmp_path, form):
+    file, xyz = tmp_path / "cloud", np.vstack([XYZ[:3], [[np.nan] * 3], XYZ[3:]])
+    if form == "npy":
+        with file.open("wb") as stream:
+            np.save(stream, xyz)
+    elif form == "text":
+        np.savetxt(file, xyz)
+    else:
+        file.write_bytes(pcd(form.split()[1]) if form.startswith("pcd") else binary("<"))
+    np.testing.assert_allclose(read_point_file(file), XYZ, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        pcd("binary")[:-9],
+        pcd("binary").replace(b"DATA binary", b"DATA binary_compressed"),
+        b"# nothing\n",
+        b"1 2 3\n1 2\n",
+    ],
+    ids=["cut", "compressed", "empty", "columns"],
+)
+def test_a_file_that_is_none_of_points_is_named(tmp_path, data):
+    (tmp_path / "cloud").write_bytes(data)
+    with pytest.raises(InputError, match="cloud"):
+        read_point_file(tmp_path / "cloud")
 
 
 def test_points_behind_another_surface_outside_or_behind_the_camera_are_not_seen():

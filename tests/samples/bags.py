@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
-from tests.captures import View
+from tests.samples.filmed import Filmed, View
 
 # T_link_optical: from a camera's axes in ROS's optical frame to those of a body (x forward, y left, z up).
 OPTICAL = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
@@ -178,3 +179,23 @@ def recording(
         messages.append(("/camera/image_raw", late + 1, make.image(time, image, "rgb8")))
         messages.append(("/camera/camera_info", late + 1, make.info(time, view.K, view.size)))
     return messages
+
+
+def write_small_bag(file: Path, form: str, filmed: Filmed, depths: bool = False) -> None:
+    """Write grey images, their camera, odometry, transforms, and points or depth images, to one file."""
+    make = Messages(form)
+    messages: list[tuple[str, int, Any]] = [("/tf_static", 1, make.tree(make.transform(0, "base", "optical", OPTICAL)))]
+    if not depths:
+        messages.append(("/map", 2, make.cloud(1, filmed.points.astype("<f4"))))
+    for i, view in enumerate(filmed.views):
+        time = i * 10**8 + 10**9
+        messages.append(("/odom", time, make.odometry(time, view.T_world_camera @ np.linalg.inv(OPTICAL))))
+        messages.append(("/image", time, make.image(time, np.ascontiguousarray(view.image[..., 1]), "mono8")))
+        messages.append(("/camera_info", time, make.info(time, view.K, view.size)))
+        if depths:
+            millimetres = np.round(1000 * view.depth(view.K, view.size)).astype("<u2")
+            messages.append(("/depth", time, make.image(time, millimetres, "16UC1")))
+    with TemporaryDirectory() as folder:
+        written = write_bag(Path(folder) / "bag", form, messages, defined=False)
+        content = written if form == "ros1" else next(each for each in written.iterdir() if each.suffix == file.suffix)
+        file.write_bytes(content.read_bytes())
