@@ -9,6 +9,7 @@ import tempfile
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import astuple
 from functools import reduce
 from pathlib import Path
 from typing import Any, ClassVar
@@ -18,14 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.frames.pose_correction import CameraRevision, PoseCorrection
-from fields.frames.tracked_frame import TrackedFrame
+from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from modp_ti.engine.interruption import Interruption
 from modp_ti.engine.mapper import Mapper
 from modp_ti.engine.stream import Conductor, FramesAhead
 from modp_ti.files.errors import InputError
 from modp_ti.files.reading import reading
-from modp_ti.inputs.frame_record import FrameRecord
 from modp_ti.inputs.protocol import Event, Tracker
 from modp_ti.inputs.sources import Picture
 from pipelines.companions.pace import Plan, RecordedPace
@@ -37,18 +37,17 @@ FILE = "session.zip"
 VERSION = 4
 ABOUT = "about.json"
 AGAIN = "; record the session again"
-# Arrays of a correction, and of its camera where it has one.
-CORRECTION = ("index", "T_camera_world", "ids", "xyz")
-REVISION = ("lookup", "covered")
+# What is written of a frame to `about.json`, and arrays of its points; arrays of a correction, and of its camera.
+PLAIN, POINTS = ("index", "timestamp", "name", "held_out", "arrived", "views"), ("xyz", "pixels", "ids")
+CORRECTION, REVISION = ("index", "T_camera_world", "ids", "xyz"), ("lookup", "covered")
 
 
 class SessionRecorder:
     """Writes a session to a temporary file while it goes on.
 
     The file is a zip of one array file per frame or correction, in their order, and of `about.json` with the settings,
-    the decisions and the measured times. There, `events` has the number of further steps before each of them, and
-    whether another correction follows at once; null for a frame. Images are kept without loss. A full disk ends the
-    recording, not the run.
+    the decisions, the measured times, and `events`: the plain values of each of them, with the number of further steps
+    before it. Images are kept without loss. A full disk ends the recording, not the run.
 
     Attributes:
         problem: Why the session cannot be recorded, in one line; None if it can.
@@ -60,7 +59,7 @@ class SessionRecorder:
         self._file = Path(self._folder.name) / FILE
         self._zip = zipfile.ZipFile(self._file, "w", zipfile.ZIP_STORED)
         self._vignette: NDArray[np.float32] | None = None
-        self._events: list[tuple[int, bool | None]] = []
+        self._events: list[dict[str, Any]] = []
         self._further = 0
         self._shares: list[float] | None = None
 
@@ -71,20 +70,21 @@ class SessionRecorder:
     def add_frame(self, frame: TrackedFrame) -> None:
         """Write a frame."""
         _, image = cv2.imencode(".png", frame.rgba, [cv2.IMWRITE_PNG_COMPRESSION, 1])
-        arrays = FrameRecord.of(frame).arrays()
-        arrays |= {"image": image, "camera": _numbers(frame.camera), "masked": np.array(frame.mask is not None)}
+        arrays = {"image": image} | {name: getattr(frame.points, name) for name in POINTS}
         if frame.vignette is not None and frame.vignette is not self._vignette:
             self._vignette = arrays["vignette"] = frame.vignette
-        self._write(arrays, None)
+        plain = {name: getattr(frame, name) for name in PLAIN}
+        pose, camera = frame.T_camera_world.tolist(), astuple(frame.camera)
+        self._write(arrays, **plain, T_camera_world=pose, camera=camera, masked=frame.mask is not None)
 
     def add_correction(self, correction: PoseCorrection, more: bool) -> None:
         """Write a correction. `more` is as in `Mapper.correct`."""
         arrays = {name: getattr(correction, name) for name in CORRECTION}
-        revision = correction.camera
+        revision, camera = correction.camera, None
         if revision is not None:
-            arrays["camera"] = _numbers(revision.camera)
+            camera = astuple(revision.camera)
             arrays |= {name: array for name in REVISION if (array := getattr(revision, name)) is not None}
-        self._write({**arrays, "others_stay": np.array(correction.others_stay)}, more)
+        self._write(arrays, more=more, others_stay=correction.others_stay, camera=camera)
 
     def recorded(self, schedule: Schedule) -> Schedule:
         """Return the schedule of a refinement, and record what it says."""
@@ -129,7 +129,7 @@ class SessionRecorder:
             self._zip.close()
         self._folder.cleanup()
 
-    def _write(self, arrays: dict[str, NDArray], more: bool | None) -> None:
+    def _write(self, arrays: dict[str, NDArray], **plain: object) -> None:
         if self.problem is not None:
             return
         file = io.BytesIO()
@@ -138,7 +138,7 @@ class SessionRecorder:
             self._zip.writestr(_name(len(self._events)), file.getvalue())
         except OSError as error:
             self._fail(Path(self._folder.name), error)
-        self._events.append((self._further, more))
+        self._events.append({"further": self._further, **plain})
         self._further = 0
 
     def _fail(self, place: Path, error: OSError) -> None:
@@ -180,9 +180,9 @@ class RecordedSession(Tracker):
                 None if plan is None else Plan(float(plan[0]), int(plan[1]), int(plan[2])) for plan in about["plans"]
             ]
             self.shares: list[float] | None = about["refinement"]
-            self._events: list[tuple[int, bool | None]] = about["events"]
-            self.further = [*(further for further, _ in self._events), int(about["further"])]
-            self.more = [more for _, more in self._events if more is not None]
+            self._events: list[dict[str, Any]] = about["events"]
+            self.further = [*(event["further"] for event in self._events), int(about["further"])]
+            self.more = [event["more"] for event in self._events if "more" in event]
 
     @property
     def notes(self) -> list[str]:
@@ -193,8 +193,10 @@ class RecordedSession(Tracker):
         return len(self._events) - len(self.more)
 
     def pictures(self, names: Sequence[str]) -> Iterator[tuple[str, Picture]]:
-        corrections = (_correction(self._arrays(n)) for n, (_, more) in enumerate(self._events) if more is not None)
-        later, wanted = [each.camera for each in corrections if each.camera is not None], set(names)
+        revising = [number for number, event in enumerate(self._events) if "more" in event and event["camera"]]
+        corrections = (_correction(self._events[number], self._arrays(number)) for number in revising)
+        later = [each.camera for each in corrections if each.camera is not None]
+        wanted = set(names)
         for event in self:
             if isinstance(event, PoseCorrection):
                 del later[: event.camera is not None]
@@ -204,11 +206,11 @@ class RecordedSession(Tracker):
 
     def __iter__(self) -> Iterator[Event]:
         vignette = None
-        for number, (_, more) in enumerate(self._events):
+        for number, about in enumerate(self._events):
             with reading(self.path, AGAIN):
                 arrays = self._arrays(number)
                 vignette = arrays.get("vignette", vignette)
-                event = _frame(arrays, vignette) if more is None else _correction(arrays)
+                event = _correction(about, arrays) if "more" in about else _frame(about, arrays, vignette)
             yield event
 
     def close(self) -> None:
@@ -223,31 +225,27 @@ def _name(number: int) -> str:
     return f"{number:06d}.npz"
 
 
-def _numbers(camera: PinholeCamera) -> NDArray[np.float64]:
-    return np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height])
-
-
-def _camera(numbers: NDArray[np.float64]) -> PinholeCamera:
-    fx, fy, cx, cy, width, height = numbers.tolist()
-    return PinholeCamera(fx, fy, cx, cy, int(width), int(height))
-
-
-def _frame(arrays: dict[str, NDArray], vignette: NDArray[np.float32] | None) -> TrackedFrame:
+def _frame(about: dict[str, Any], arrays: dict[str, NDArray], vignette: NDArray[np.float32] | None) -> TrackedFrame:
     rgba = cv2.imdecode(arrays["image"], cv2.IMREAD_UNCHANGED)
     if rgba is None or rgba.dtype != np.uint8:
         raise ValueError("its picture is damaged")
-    image, mask = np.divide(rgba[..., :3], np.float32(255.0), dtype=np.float32), rgba[..., 3] > 0
-    picture = Picture(image, mask if bool(arrays["masked"]) else None, vignette, _camera(arrays["camera"]))
-    return FrameRecord.of_arrays(arrays).with_picture(picture)
-
-
-def _correction(arrays: dict[str, NDArray]) -> PoseCorrection:
-    camera = None
-    if "camera" in arrays:
-        camera = CameraRevision(_camera(arrays["camera"]), arrays.get("lookup"), arrays.get("covered"))
-    return PoseCorrection(
-        **{name: arrays[name] for name in CORRECTION}, camera=camera, others_stay=bool(arrays["others_stay"])
+    return TrackedFrame(
+        **{name: about[name] for name in PLAIN},
+        image=np.divide(rgba[..., :3], np.float32(255.0), dtype=np.float32),
+        camera=PinholeCamera(*about["camera"]),
+        T_camera_world=np.array(about["T_camera_world"]),
+        points=SparsePoints(**{name: arrays[name] for name in POINTS}),
+        mask=rgba[..., 3] > 0 if about["masked"] else None,
+        vignette=vignette,
     )
+
+
+def _correction(about: dict[str, Any], arrays: dict[str, NDArray]) -> PoseCorrection:
+    camera, revision = about["camera"], None
+    if camera is not None:
+        revision = CameraRevision(PinholeCamera(*camera), *(arrays.get(name) for name in REVISION))
+    plain = {name: arrays[name] for name in CORRECTION}
+    return PoseCorrection(**plain, camera=revision, others_stay=about["others_stay"])
 
 
 class ReplayedRun(Conductor):

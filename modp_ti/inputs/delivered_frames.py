@@ -13,7 +13,6 @@ from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from fields.map.trajectory import Trajectory
-from modp_ti.inputs.frame_record import FrameRecord
 from modp_ti.inputs.protocol import Tracker
 from modp_ti.inputs.tracked_points import TrackedPoints
 
@@ -105,10 +104,16 @@ class DeliveredFrames:
             place = places[name]
             rows, pixels = self.points.rows[place], self.points.pixels[place].astype(np.float64)
             points, index = SparsePoints(xyz[rows], pixels, ids[rows]), self.index[place]
-            record = FrameRecord(
-                index, self.timestamp[place], name, self.trajectory[index], points, self.held_out[place]
+            pose, held_out = self.trajectory[index], self.held_out[place]
+            yield TrackedFrame(
+                index,
+                self.timestamp[place],
+                name,
+                T_camera_world=pose,
+                points=points,
+                held_out=held_out,
+                **vars(picture),
             )
-            yield record.with_picture(picture)
 
 
 def settled(tracker: Tracker) -> Iterator[TrackedFrame]:

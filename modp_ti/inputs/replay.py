@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from fields.frames.origin import far_origin
 from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from modp_ti.files.errors import FEW, InputError, UnreadableImageError
-from modp_ti.inputs.frame_record import FrameRecord
 from modp_ti.inputs.protocol import Tracker
 from modp_ti.inputs.sources import FrameReader, ImageSource, Picture, Undistorter
 
@@ -204,7 +203,7 @@ def tracked_frame(
         column, row = np.floor(points.pixels).astype(int).T
         kept = picture.mask[row, column]
         points = SparsePoints(points.xyz[kept], points.pixels[kept], points.ids[kept])
-    record = FrameRecord(
+    return TrackedFrame(
         index=index,
         timestamp=reader.images.timestamp(frame.name),
         name=frame.name,
@@ -213,8 +212,8 @@ def tracked_frame(
         held_out=is_held_out(index if place is None else place, reader.source),
         arrived=reader.images.arrived(frame.name),
         views=reader.source.panorama.count,
+        **vars(picture),
     )
-    return record.with_picture(picture)
 
 
 def is_held_out(index: int, source: SourceSettings) -> bool:

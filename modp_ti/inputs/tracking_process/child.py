@@ -7,7 +7,9 @@ import sys
 import threading
 from collections import deque
 from contextlib import suppress
+from dataclasses import fields
 from multiprocessing.connection import Connection
+from typing import Any
 
 import cv2
 
@@ -16,11 +18,10 @@ from fields.frames.tracked_frame import TrackedFrame
 from modp_ti.files.errors import InputError
 from modp_ti.files.processes import left_to_parent
 from modp_ti.files.terminal import own_terminal
-from modp_ti.inputs.frame_record import FrameRecord
 from modp_ti.inputs.klt import KltTracker, open_klt
 from modp_ti.inputs.opening import open_source
 from modp_ti.inputs.readers.klt import KltSettings
-from modp_ti.inputs.sources import FrameReader, ImageSource, Undistorter
+from modp_ti.inputs.sources import FrameReader, ImageSource, Picture, Undistorter
 from modp_ti.inputs.tracking_process.exchange import (
     CameraRevised,
     CountsBoard,
@@ -39,6 +40,10 @@ LIMIT = 2000
 # Memory of the images of waiting frames [bytes], for example of 140 frames of 320x240. Reading an image again takes a
 # third of the time of tracking it, on the same core: with room for four, a stream of 30 frames a second fell behind.
 ROOM = 128 << 20
+
+# Names of the attributes of a frame without its picture, which is read again, and their values by name.
+REST = {field.name for field in fields(TrackedFrame)} - {field.name for field in fields(Picture)}
+WithoutPicture = dict[str, Any]
 
 _Message = PoseCorrection | CameraRevised | Ended
 
@@ -128,8 +133,8 @@ class _Child:
         while True:
             event = self._outbox.get()
             try:
-                if isinstance(event, FrameRecord):
-                    event = event.with_picture(reader.read(event.name, undistorter))
+                if isinstance(event, dict):
+                    event = TrackedFrame(**event, **vars(reader.read(event["name"], undistorter)))
                 if isinstance(event, TrackedFrame):
                     if event.vignette is not vignette:
                         vignette = event.vignette
@@ -182,7 +187,7 @@ class Outbox:
     def __init__(self, room: int = ROOM) -> None:
         self._room = room
         self._taken = 0
-        self._events: deque[TrackedFrame | FrameRecord | _Message] = deque()
+        self._events: deque[TrackedFrame | WithoutPicture | _Message] = deque()
         self._changed = threading.Condition()
 
     def put(self, event: TrackedFrame | _Message) -> None:
@@ -195,10 +200,10 @@ class Outbox:
                 self._taken += event.image.nbytes
                 self._events.append(event)
             else:
-                self._events.append(FrameRecord.of(event))
+                self._events.append({name: getattr(event, name) for name in REST})
             self._changed.notify_all()
 
-    def get(self) -> TrackedFrame | FrameRecord | _Message:
+    def get(self) -> TrackedFrame | WithoutPicture | _Message:
         """Take the first event; wait for it."""
         with self._changed:
             self._changed.wait_for(lambda: len(self._events) > 0)

@@ -17,7 +17,6 @@ from modp_ti.config.scene_file import load_scene
 from modp_ti.config.settings import SceneConfig
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.colmap_model import read_colmap_model
-from modp_ti.inputs.frame_record import FrameRecord
 from modp_ti.inputs.opening import open_source, open_tracker
 from modp_ti.inputs.protocol import Progress
 from modp_ti.inputs.readers.transforms import TransformsSettings, masks_of_transforms
@@ -132,8 +131,9 @@ def frames_of(run: FinishedRun, places: Sequence[int], preparing: Progress | Non
     with closing(pictures(run, places, preparing)) as images:
         for place, picture in zip(places, images, strict=True):
             time, name = float(run.timestamps[place]), run.names[place]
-            record = FrameRecord(place, time, name, run.poses[place], SparsePoints(), place in held_out)
-            yield record.with_picture(picture)
+            yield TrackedFrame(
+                place, time, name, T_camera_world=run.poses[place], held_out=place in held_out, **vars(picture)
+            )
 
 
 class FinishedFrames:

@@ -10,7 +10,6 @@ import numpy as np
 
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
-from modp_ti.inputs.frame_record import FrameRecord
 from modp_ti.inputs.protocol import LiveCounts
 from modp_ti.inputs.sources import Picture
 from modp_ti.inputs.tracking_process import child as module
@@ -32,10 +31,9 @@ def test_order_is_kept_and_only_the_first_frames_keep_their_images():
     outbox.put(frames[4])
     got = [outbox.get() for _ in range(5)]
     assert got[0] is frames[1] and got[2] is correction and got[3] is frames[3]
-    assert isinstance(got[1], FrameRecord) and isinstance(got[4], FrameRecord)
+    assert isinstance(got[1], dict) and isinstance(got[4], dict)
     picture = Picture(frames[2].image, None, None, frames[2].camera)
-    assert_same(got[1].with_picture(picture), frames[2])
-    assert_same(FrameRecord.of_arrays(got[1].arrays()).with_picture(picture), frames[2])
+    assert_same(TrackedFrame(**got[1], **vars(picture)), frames[2])
 
 
 def test_the_tracker_waits_only_at_the_limit(monkeypatch):
@@ -57,7 +55,8 @@ def test_the_tracker_waits_only_at_the_limit(monkeypatch):
     assert isinstance(first, TrackedFrame) and first.index == 0
     assert put.acquire(timeout=PATIENCE)
     thread.join(PATIENCE)
-    assert [outbox.get().index for _ in range(3)] == [1, 2, 3]
+    second, third, last = (outbox.get() for _ in range(3))
+    assert (second["index"], third["index"], last.index) == (1, 2, 3)
 
 
 def test_a_frame_keeps_its_pyramid_and_shares_its_vignette():
