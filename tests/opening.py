@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from modp_ti.config.scene_file import load_scene
-from modp_ti.config.settings import SceneConfig, SourceSettings
+from modp_ti.config.settings import SceneConfig
 from modp_ti.files.errors import InputError
 from modp_ti.files.file_tree import open_tree
 from modp_ti.inputs.capture import Capture
@@ -17,6 +17,7 @@ from modp_ti.inputs.protocol import Progress
 from modp_ti.inputs.reader import TrackerSettings
 from modp_ti.inputs.readers import READERS, SOURCES
 from modp_ti.inputs.replay import ReplayedTracker
+from modp_ti.inputs.source_settings import SourceSettings
 
 CAPTURES = {kind: reader for kind, reader in READERS.items() if issubclass(reader, CaptureSettings)}
 

@@ -54,12 +54,12 @@ def check(
 ) -> None:
     """Look a scene's input over without mapping it. Exit code: 0 fine, 1 with warnings, 2 unusable."""
     with outcome(as_json) as result:
+        from modp_ti.config.bare_recording import base_of, named_scene
+        from modp_ti.config.scene_paths import refuse_output_in_input
         from modp_ti.files.run_folder import require_usable
         from modp_ti.files.terminal import CleanConsole
-        from modp_ti.inputs.bare_recording import base_of, named_scene
         from modp_ti.inputs.inspection.findings import unusable
         from modp_ti.inputs.inspection.report import judged, print_report
-        from modp_ti.inputs.scene_paths import refuse_output_in_input
         from modp_ti.outputs.progress import ProgressLine
 
         try:

@@ -151,9 +151,9 @@ def _settings(
 ) -> tuple[SceneConfig, Snapshot | None]:
     """Return the settings of a run, and the snapshot that it resumes from, if any."""
     # Imported here, so that `--help` does not wait for Taichi and the readers to load.
+    from modp_ti.config.bare_recording import base_of, is_recording, named_scene, streamed_scene
+    from modp_ti.config.scene_paths import refuse_output_in_input
     from modp_ti.files.run_folder import require_usable
-    from modp_ti.inputs.bare_recording import base_of, is_recording, named_scene, streamed_scene
-    from modp_ti.inputs.scene_paths import refuse_output_in_input
     from modp_ti.outputs.progress import ProgressLine
 
     if resume is not None:

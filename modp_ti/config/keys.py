@@ -15,6 +15,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from modp_ti.files.errors import shown_url
+from modp_ti.inputs.reader import in_a_sentence
 
 TYPE_NAMES = {int: "integer", float: "number", str: "text", bool: "true or false", Path: "path", NoneType: "empty"}
 
@@ -22,12 +23,6 @@ TYPE_NAMES = {int: "integer", float: "number", str: "text", bool: "true or false
 def as_yaml(value: Any) -> str:
     """Format a value as one line of YAML, a URL without its secrets."""
     return json.dumps(shown_url(value) if isinstance(value, str) else value, ensure_ascii=False, default=str)
-
-
-def described(model: type[BaseModel]) -> str:
-    """Return what a model is, in words that may stand within a sentence: the first line of its docstring."""
-    first = (model.__doc__ or "").partition("\n")[0].removesuffix(".")
-    return first[:1].lower() + first[1:]
 
 
 @dataclass(frozen=True)
@@ -76,7 +71,7 @@ def documented_keys(
             if not selects and not info.is_required():
                 value = info.get_default(call_default_factory=True, validated_data={})
                 default = "" if value is None else as_yaml(value)
-            description = info.description or (described(model) if selects else "")
+            description = info.description or (in_a_sentence(model) if selects else "")
             yield KeyDoc(prefix + name, _type_name(info.annotation), default, description, variant, selects)
 
 

@@ -16,12 +16,13 @@ from pydantic_core import ErrorDetails
 
 from modp_ti.config.keys import as_yaml, differing_keys, documented_keys, dotted_keys, suggestion
 from modp_ti.config.presets import PRESETS, with_defaults
-from modp_ti.config.settings import WITH_SECRETS, SceneConfig
+from modp_ti.config.settings import SceneConfig
 from modp_ti.files import read_text
 from modp_ti.files.atomic import replace_text
 from modp_ti.files.errors import FROM_FILE, InputError, shown_url
 from modp_ti.files.terminal import require_text
 from modp_ti.files.yaml_text import parse_yaml
+from modp_ti.inputs.source_settings import WITH_SECRETS
 
 M = TypeVar("M", bound=BaseModel)
 

@@ -1,8 +1,10 @@
 """The settings of a scene as one strict model, `SceneConfig`.
 
-`modp_ti.config.scene_file` reads and writes its files. The cameras of `source` are defined in
-`modp_ti.config.camera_settings`, the `tracker` section in `modp_ti.inputs.readers`; `evaluation`, `export` and `view`
- in `modp_ti.config.output_settings`; `mapping`, `refine` and `offline` in `pipelines.settings`.
+`modp_ti.config.scene_file` reads and writes its files. The section `source` is defined in
+`modp_ti.inputs.source_settings`, `tracker` in `modp_ti.inputs.readers`; `evaluation`, `export` and `view` in
+`modp_ti.config.output_settings`; `mapping`, `refine` and `offline` in `pipelines.settings`. What a single section can
+decide alone, such as an empty range of frames, is decided by its model; which settings exclude each other, by
+`EXCLUSIONS`.
 """
 
 from __future__ import annotations
@@ -12,176 +14,64 @@ from operator import or_
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from pydantic import Field, SerializationInfo, field_serializer, field_validator, model_validator
+from pydantic import Field, field_serializer, model_validator
 
 from fields.runtime.process import available_cores
-from modp_ti.config.camera_settings import BagImagesSettings, IntrinsicsSettings, PanoramaSettings, VrsSettings
-from modp_ti.config.combinations import refuse_exclusions
 from modp_ti.config.output_settings import EvaluationSettings, ExportSettings, ViewSettings
-from modp_ti.files.errors import InputError, shown_url
-from modp_ti.inputs.reader import TrackerSettings
+from modp_ti.inputs.reader import GivenPosesSettings, TrackerSettings
 from modp_ti.inputs.readers import READERS, SOURCES
+from modp_ti.inputs.source_settings import NO_PATH, SourceSettings, written
 from pipelines.settings import MappingSettings, OfflineSettings, RefineSettings, StrictModel
 
-__all__ = [
-    "LONGER_SIDE",
-    "WITH_SECRETS",
-    "EvaluationSettings",
-    "ExportSettings",
-    "IntrinsicsSettings",
-    "PanoramaSettings",
-    "SceneConfig",
-    "SourceSettings",
-    "ViewSettings",
-    "VrsSettings",
-]
+SOURCE_KINDS = ("auto", "images", "video", "live", *SOURCES)
 
-LONGER_SIDE = 480
-"""Longest side [px] of a mapped image where `source.scale` is `auto`."""
+# Names of `used_settings` for frames that do not wait, the most telling first, and for a tracker by what it lacks.
+CLOCK = ("source.stream", "source.realtime", "a live tracker", "mapping.pace: realtime")
+TRACKED, RECORDED = "a tracker of images as they come", "a tracker of recordings"
+CAMERAS, NO_PANORAMAS = "a tracker with cameras", "a tracker without panoramas"
 
-WITH_SECRETS = {"secrets": True}
-"""Context of `model_dump` that keeps users, passwords and queries of URLs."""
-
-NO_PATH = "source.path is missing: set it to the folder of the images"
-
+EXCLUSIONS: tuple[tuple[str, tuple[str, ...], str], ...] = (
+    (
+        "source.stream",
+        ("source.path", "source.kind", "source.realtime"),
+        "a stream is where the images come from, and always sets the pace",
+    ),
+    ("source.stream", (RECORDED,), "it needs recorded images; set source.path, or take tracker.kind: klt"),
+    ("source.realtime", (RECORDED,), "it does not follow images as they arrive; take tracker.kind: klt"),
+    ("source.intrinsics", (CAMERAS,), "it provides the camera of every image"),
+    ("tracker.maps", CLOCK[:2], "it needs all images before the first is mapped; record them first"),
+    (
+        "source.panorama",
+        ("source.stream", "source.realtime", "source.intrinsics", "source.masks", "source.vignette"),
+        "a panorama is cut into faces, whose cameras are computed",
+    ),
+    (
+        "source.panorama",
+        (NO_PANORAMAS,),
+        "it has no poses of panoramas; take sfm, transforms, tum, orbslam3, matrices or tanksandtemples",
+    ),
+    (
+        "source.panorama",
+        ("tracker.adjust", "onto", "parts", "source.part", CLOCK[-1]),
+        "the faces of a panorama keep together, in one map",
+    ),
+    ("snapshot_every", ("mode: offline", *CLOCK), "a run resumes by reading its frames again; record them"),
+    ("onto", ("mode: offline", *CLOCK), "frames wait while they are located in the finished map; record them"),
+    ("onto", ("tracker.maps: all",), "one map is continued: set tracker.maps to first, largest or a number"),
+    ("onto", ("parts",), "parts make a new map"),
+    ("parts", ("source.part",), "the whole recording is cut into parts"),
+    *(
+        (key, (TRACKED, "mode: offline", *CLOCK), "all poses are needed beforehand; take tracker.kind: sfm")
+        for key in ("parts", "source.part")
+    ),
+)
+"""A setting, those that it cannot be combined with, and why, by the names of `used_settings`."""
 
 # The kinds are those of the readers: a new one is a file in `modp_ti.inputs.readers`.
 if TYPE_CHECKING:
-    AnySource = str
     AnyTracker = TrackerSettings
 else:
-    AnySource = Literal[("auto", "images", "video", "live", *SOURCES)]
     AnyTracker = Annotated[reduce(or_, READERS.values()), Field(discriminator="kind")]
-
-
-def _written(url: int | str | None, info: SerializationInfo) -> int | str | None:
-    """What is written of a URL: its secrets only for the processes of a run, which ask for them in the context."""
-    return shown_url(url) if isinstance(url, str) and info.context != WITH_SECRETS else url
-
-
-class SourceSettings(StrictModel):
-    """The source of the images, and how they are selected, scaled and masked."""
-
-    kind: AnySource = Field(
-        default="auto",
-        description="type of `path` or `stream`; `auto` detects it. `images`: a folder of images; `release`: the "
-        "folder of an Aria sequence of the paper's release; `vrs`: a Project Aria recording; `bag`: a ROS bag; the "
-        "others: data sets, and captures of phones (docs/trackers.md)",
-    )
-    path: Path | None = Field(
-        default=None,
-        description="folder of the images (including subfolders), data set, video file or recording; not for the "
-        "tracker `socket`",
-    )
-    stream: int | str | None = Field(
-        default=None,
-        description="instead of `path`: number of a camera or URL of a stream, for live frames. `from-env:NAME` and "
-        "`from-file:PATH` take the URL from an environment variable or a text file, which keeps its password secret",
-    )
-    realtime: bool = Field(
-        default=False, description="deliver the images of a file or folder at the times of their time stamps"
-    )
-    intrinsics: IntrinsicsSettings = IntrinsicsSettings()
-    vrs: VrsSettings = VrsSettings()
-    panorama: PanoramaSettings = PanoramaSettings()
-    bag: BagImagesSettings = BagImagesSettings()
-    scale: Literal["auto"] | Annotated[float, Field(gt=0, le=1)] = Field(
-        default="auto",
-        description=f"factor on the width and height of every frame. `auto` makes the longer side {LONGER_SIDE} pixels "
-        "if it is longer; images of the tracker `socket` keep their size",
-    )
-    holdout: int | None = Field(
-        default=None,
-        ge=2,
-        description="n: frames 0, n, 2n, ... are used only for evaluation, of panoramas all their faces; empty: none",
-    )
-    fps: float = Field(
-        default=30.0,
-        gt=0,
-        description="frames per second, for sources without time stamps: time = position in the folder / fps",
-    )
-    start: int = Field(default=0, ge=0, description="position of the first frame in the folder")
-    stop: int | None = Field(default=None, ge=1, description="position after the last frame; empty: all frames")
-    step: int = Field(default=1, ge=1, description="use every n-th frame")
-    part: tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=1)]] | None = Field(
-        default=None,
-        description="[first, end]: of the tracked frames, only those at the positions from `first` to before `end` are "
-        "mapped. The whole recording is tracked, and the same frames are held out. Empty: all of them",
-    )
-    masks: Path | None = Field(
-        default=None,
-        description="folder of masks with the names and sizes of the images: white pixels are valid, black ones "
-        "ignored; empty: no masks",
-    )
-    mask_colour: tuple[int, int, int] | None = Field(
-        default=None, description="[red, green, blue] (0-255): pixels of this colour are ignored; empty: none"
-    )
-    mask_tolerance: int = Field(
-        default=0,
-        ge=0,
-        le=255,
-        description="largest difference from mask_colour per channel; use about 10 for JPEG images",
-    )
-    prefetch: int = Field(
-        default=4,
-        ge=0,
-        description="number of frames that a second thread decodes, undistorts and downsamples in advance; 0: no "
-        "thread. The map does not depend on it",
-    )
-    vignette: Path | None = Field(
-        default=None,
-        description="image of the share of light that reaches each pixel (white: all of it). With `vrs`: Aria's "
-        "vignetting mask, which belongs to the recorded image. Empty: the vignette of the source, if it has one",
-    )
-
-    ground_truth: Path | None = Field(
-        default=None,
-        description="true trajectory of the camera in TUM's format, matched with the frames by time: used only for the "
-        "trajectory errors (`ate_rmse`) in `metrics.json` and the report; empty for none",
-    )
-
-    _without_secrets = field_serializer("stream")(_written)
-
-    @property
-    def follows_clock(self) -> bool:
-        """Whether the images arrive by the clock instead of when they are asked for."""
-        return self.realtime or self.stream is not None
-
-    def scale_for(self, width: int, height: int) -> float:
-        """Return the scale of images of this size: `scale` if it is a number, otherwise what `auto` chooses.
-
-        Args:
-            width: Width of the stored images [px].
-            height: Height of the stored images [px].
-        """
-        return min(1.0, LONGER_SIDE / max(width, height)) if self.scale == "auto" else self.scale
-
-    def require_path(self) -> Path:
-        """Return `path`.
-
-        Raises:
-            InputError: If `path` is empty.
-        """
-        if self.path is None:
-            raise InputError(NO_PATH)
-        return self.path
-
-    @field_validator("mask_colour")
-    @classmethod
-    def _colour_has_8_bits(cls, colour: tuple[int, int, int] | None) -> tuple[int, int, int] | None:
-        if colour is not None and not all(0 <= value <= 255 for value in colour):
-            raise ValueError(f"source.mask_colour must be three numbers from 0 to 255, not {list(colour)}")
-        return colour
-
-    @model_validator(mode="after")
-    def _is_complete(self) -> SourceSettings:
-        if self.stream is None and self.kind == "live":
-            raise ValueError("source.stream is missing: set it to a camera number or a URL for `source.kind: live`")
-        if self.stop is not None and self.stop <= self.start:
-            raise ValueError(f"source.stop ({self.stop}) must be larger than source.start ({self.start})")
-        if self.part is not None and self.part[1] <= self.part[0]:
-            raise ValueError(f"source.part ends at {self.part[1]}, which must be larger than {self.part[0]}")
-        return self
 
 
 class SceneConfig(StrictModel):
@@ -233,7 +123,7 @@ class SceneConfig(StrictModel):
         "machine continues from there (`modp-ti run SCENE --resume OUT`, `modp-ti batch --store`). `from-env:` and "
         "`from-file:` as for `source.stream`. Empty: none",
     )
-    _without_secrets = field_serializer("snapshot_store")(_written)
+    _without_secrets = field_serializer("snapshot_store")(written)
 
     threads: int | None = Field(
         default=None,
@@ -297,7 +187,51 @@ class SceneConfig(StrictModel):
 
     @model_validator(mode="after")
     def _can_be_run(self) -> SceneConfig:
+        if self.source.kind not in SOURCE_KINDS:
+            raise ValueError(f"source.kind: must be {', '.join(map(repr, SOURCE_KINDS))}, not {self.source.kind!r}")
         if self.source.path is None and self.source.stream is None and self.tracker.needs_source:
             raise ValueError(NO_PATH)
         refuse_exclusions(self)
         return self
+
+
+def used_settings(scene: SceneConfig) -> dict[str, str]:
+    """Return the settings of a scene that exclude others: by their names in `EXCLUSIONS`, how the user knows them."""
+    source, tracker = scene.source, scene.tracker
+    kind = f"tracker.kind: {tracker.kind}"
+    maps = getattr(tracker, "maps", "first")
+    adjusts = isinstance(tracker, GivenPosesSettings) and tracker.adjusts
+    used: dict[str, bool | str] = {
+        "source.path": source.path is not None,
+        "source.kind": source.kind not in ("auto", "live") and f"source.kind: {source.kind}",
+        "source.stream": source.stream is not None,
+        "source.realtime": source.realtime,
+        "source.intrinsics": source.intrinsics.given,
+        "source.masks": source.masks is not None,
+        "source.vignette": source.vignette is not None,
+        "source.panorama": source.panorama.given,
+        "source.part": source.part is not None,
+        "tracker.maps": maps != "first" and f"tracker.maps: {maps}",
+        "tracker.maps: all": maps == "all",
+        "tracker.adjust": adjusts,
+        TRACKED: (tracker.follows_streams or tracker.is_live) and kind,
+        RECORDED: not tracker.follows_streams and kind,
+        CAMERAS: tracker.brings_cameras and kind,
+        NO_PANORAMAS: not tracker.places_panoramas and kind,
+        "a live tracker": tracker.is_live and kind,
+        "mapping.pace: realtime": scene.is_realtime,
+        "mode: offline": scene.mode == "offline",
+        "snapshot_every": bool(scene.snapshot_every),
+        "onto": scene.onto is not None,
+        "parts": scene.parts is not None,
+    }
+    return {name: name if shown is True else shown for name, shown in used.items() if shown}
+
+
+def refuse_exclusions(scene: SceneConfig) -> None:
+    """Raise ValueError for the first two settings of a scene that cannot be combined."""
+    used = used_settings(scene)
+    for key, others, why in EXCLUSIONS:
+        for other in others:
+            if key in used and other in used:
+                raise ValueError(f"{key} cannot be combined with {used[other]}; remove one of them: {why}")

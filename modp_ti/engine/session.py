@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from fields.frames.tracked_frame import TrackedFrame
+from modp_ti.config.scene_paths import refuse_output_in_input
 from modp_ti.config.settings import SceneConfig
 from modp_ti.engine.interruption import RunStopped
 from modp_ti.engine.recording import RecordedSession
@@ -21,7 +22,6 @@ from modp_ti.engine.stages import FinishedMap, finish_map, map_stream, open_run
 from modp_ti.engine.stream import FramesAhead
 from modp_ti.files.errors import InputError
 from modp_ti.files.run_folder import run_folder
-from modp_ti.inputs.scene_paths import refuse_output_in_input
 from modp_ti.inputs.timed_poses import true_poses
 from modp_ti.outputs.evaluation import FrameScore, evaluate, trajectory_errors
 from modp_ti.outputs.progress import ProgressLine, StageProgress

@@ -14,15 +14,13 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from fields.frames.tracked_frame import SparsePoints
-from modp_ti.config.keys import described
 from modp_ti.files import reading
 from modp_ti.files.errors import FEW, InputError
 from modp_ti.files.file_tree import SETTING, FileTree, open_tree
 from modp_ti.inputs.capture import Capture, CapturedFrame
 from modp_ti.inputs.depth_maps import depth_points
 from modp_ti.inputs.posed_recording import PosedRecording, StoredView
-from modp_ti.inputs.protocol import Progress, Tracker
-from modp_ti.inputs.reader import PosesSettings, kind_of
+from modp_ti.inputs.reader import PosesSettings, in_a_sentence, kind_of
 from modp_ti.inputs.sources.image_folder import ListedImages
 from modp_ti.inputs.sources.orientation import Turn
 from modp_ti.inputs.sources.protocol import ImageSource
@@ -30,7 +28,7 @@ from modp_ti.inputs.sources.undistortion import Intrinsics, both_valid
 from modp_ti.inputs.sources.video_file import VideoFile
 
 if TYPE_CHECKING:
-    from modp_ti.config.settings import SceneConfig, SourceSettings
+    from modp_ti.inputs.source_settings import SourceSettings
 
 
 class CaptureSettings(PosesSettings):
@@ -90,16 +88,14 @@ class CaptureSettings(PosesSettings):
         images.intrinsics = Intrinsics(frames[0].camera, first.lens)
         return images
 
-    def open(self, scene: SceneConfig, progress: Progress | None = None) -> Tracker:
-        """Open the images of a capture that have a pose, each with its own camera."""
-        source = scene.source
+    def images_of(self, source: SourceSettings) -> SourceSettings:
+        """Return the settings with the kind of the capture: both are one."""
         if source.kind not in ("auto", self.kind):
             raise InputError(
                 f"{source.path}: source.kind: {source.kind} has no poses of tracker.kind: {self.kind}: leave "
                 "source.kind out"
             )
-        source = source.model_copy(update={"kind": self.kind})
-        return super().open(scene.model_copy(update={"source": source}), progress)
+        return source.model_copy(update={"kind": self.kind})
 
     def add_poses(self, recording: PosedRecording) -> None:
         """Give images their cameras and poses. Points are those of the depth maps, or are triangulated."""
@@ -178,7 +174,7 @@ def _capture(reader: type[CaptureSettings], path: Path) -> Capture:
             raise InputError(f"{path}: is no capture of kind {kind_of(reader)}, which holds {reader.holds}{SETTING}")
         with reading(tree.path, SETTING):
             capture = reader.read(tree)
-        return replace(capture, notes=[f"{tree.path}: is {described(reader)}", *capture.notes])
+        return replace(capture, notes=[f"{tree.path}: is {in_a_sentence(reader)}", *capture.notes])
     except InputError:
         trees[0].close()
         raise

@@ -17,7 +17,7 @@ from modp_ti.inputs.sources.undistortion import given_intrinsics
 from modp_ti.inputs.sources.video_file import VIDEO_SUFFIXES, VideoFile, is_video
 
 if TYPE_CHECKING:
-    from modp_ti.config.settings import SceneConfig, SourceSettings
+    from modp_ti.inputs.source_settings import Scene, SourceSettings
 
 
 def open_source(source: SourceSettings, folder: Path | None = None) -> ImageSource:
@@ -60,7 +60,7 @@ def open_source(source: SourceSettings, folder: Path | None = None) -> ImageSour
     return PacedSource(images) if source.realtime else images
 
 
-def open_tracker(config: SceneConfig, progress: Progress | None = None) -> Tracker:
+def open_tracker(config: Scene, progress: Progress | None = None) -> Tracker:
     """Open the configured tracker. Its input is checked as far as possible without decoding all images.
 
     Args:

@@ -26,7 +26,7 @@ from modp_ti.inputs.sources.protocol import require_intrinsics
 from modp_ti.inputs.sources.undistortion import undistorter_beside
 
 if TYPE_CHECKING:
-    from modp_ti.config.settings import SourceSettings
+    from modp_ti.inputs.source_settings import SourceSettings
 
 T = TypeVar("T")
 

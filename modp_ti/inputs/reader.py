@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import BaseModel, Field, model_validator
 
 from modp_ti.files.errors import InputError
 from modp_ti.files.file_tree import FileTree
@@ -20,7 +20,7 @@ from modp_ti.inputs.timed_poses import on_the_clock_of, read_trajectory_file
 from pipelines.settings import StrictModel
 
 if TYPE_CHECKING:
-    from modp_ti.config.settings import SceneConfig, SourceSettings
+    from modp_ti.inputs.source_settings import Scene, SourceSettings
     from modp_ti.inputs.sources import ImageSource
 
 
@@ -52,7 +52,7 @@ class TrackerSettings(StrictModel):
     """Patterns of the files of poses in a folder of images that has no scene file, in the order of preference."""
 
     @abstractmethod
-    def open(self, scene: SceneConfig, progress: Progress | None = None) -> Tracker:
+    def open(self, scene: Scene, progress: Progress | None = None) -> Tracker:
         """Open the tracker of a scene whose `tracker` is this. See `modp_ti.open_tracker`."""
 
     @classmethod
@@ -82,6 +82,12 @@ class TrackerSettings(StrictModel):
         return next((file for pattern in cls.pose_files for file in path.glob(pattern)), None)
 
 
+def in_a_sentence(model: type[BaseModel]) -> str:
+    """Return what a model of settings is, in words for within a sentence: the first line of its docstring."""
+    first = (model.__doc__ or "").partition("\n")[0].removesuffix(".")
+    return first[:1].lower() + first[1:]
+
+
 def kind_of(reader: type[TrackerSettings]) -> str:
     """Return the `tracker.kind` of a reader."""
     return reader.model_fields["kind"].default
@@ -90,15 +96,19 @@ def kind_of(reader: type[TrackerSettings]) -> str:
 class PosesSettings(TrackerSettings):
     """Base class for trackers that read the results of earlier tracking, all at once."""
 
-    def open(self, scene: SceneConfig, progress: Progress | None = None) -> Tracker:
+    def open(self, scene: Scene, progress: Progress | None = None) -> Tracker:
         """Open the images, and give them the poses and points of `add_poses`."""
-        recording = PosedRecording(scene.source, progress)
+        recording = PosedRecording(self.images_of(scene.source), progress)
         try:
             self.add_poses(recording)
         except InputError:
             recording.images.close()
             raise
         return recording.tracker()
+
+    def images_of(self, source: SourceSettings) -> SourceSettings:
+        """Return the settings of the images that the poses are of."""
+        return source
 
     @abstractmethod
     def add_poses(self, recording: PosedRecording) -> None:

@@ -17,7 +17,7 @@ from modp_ti.inputs.protocol import Tracker
 from modp_ti.inputs.sources import FrameReader, ImageSource, Picture, Undistorter
 
 if TYPE_CHECKING:
-    from modp_ti.config.settings import SourceSettings
+    from modp_ti.inputs.source_settings import SourceSettings
 
 ALL_HELD_OUT = "all frames are held out, so that nothing is mapped: select more, or set source.holdout: null"
 """Message on a recording of held-out frames alone."""

@@ -10,12 +10,13 @@ from time import monotonic
 
 from rich.console import Console
 
-from modp_ti.config.settings import WITH_SECRETS, SceneConfig, ViewSettings
+from modp_ti.config.bare_recording import base_of, named_scene
+from modp_ti.config.scene_paths import refuse_output_in_input
+from modp_ti.config.settings import SceneConfig, ViewSettings
 from modp_ti.engine.interruption import Interruption
 from modp_ti.files.errors import InputError, actual_url, shown_url
 from modp_ti.files.run_folder import appearing
-from modp_ti.inputs.bare_recording import base_of, named_scene
-from modp_ti.inputs.scene_paths import refuse_output_in_input
+from modp_ti.inputs.source_settings import WITH_SECRETS
 from modp_ti.many.pool import Ended, Pool, Resources, Running
 from modp_ti.many.results import (
     BatchProgress,

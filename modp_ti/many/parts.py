@@ -14,6 +14,7 @@ from typing import Any
 from rich.console import Console
 
 from fields.frames.tracked_frame import TrackedFrame
+from modp_ti.config.scene_paths import refuse_output_in_input
 from modp_ti.config.settings import SceneConfig
 from modp_ti.engine.mapper import Mapper
 from modp_ti.engine.second_visit import EarlierMap
@@ -22,7 +23,6 @@ from modp_ti.files.errors import InputError
 from modp_ti.files.run_folder import appearing, run_folder
 from modp_ti.inputs.opening import open_tracker
 from modp_ti.inputs.protocol import Event, Tracker
-from modp_ti.inputs.scene_paths import refuse_output_in_input
 from modp_ti.many.batch import LOGS, Scene, for_a_task, run_batch, with_store
 from modp_ti.many.pool import open_pool
 from modp_ti.many.results import figures, last_stage

@@ -9,7 +9,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from modp_ti.config.camera_settings import BagImagesSettings
 from modp_ti.files.errors import InputError, UnreadableImageError
 from modp_ti.inputs.bags.bag import IMAGES, INFO, Bag, Place
 from modp_ti.inputs.bags.messages import (
@@ -27,6 +26,7 @@ from modp_ti.inputs.bags.messages import (
     video_codec,
 )
 from modp_ti.inputs.bags.transforms import clean, seconds
+from modp_ti.inputs.source_settings import BagImagesSettings
 from modp_ti.inputs.sources.image_pixels import DEPTHS, used_bits
 from modp_ti.inputs.sources.protocol import ImageSource
 from modp_ti.inputs.sources.undistortion import Intrinsics

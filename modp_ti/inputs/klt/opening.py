@@ -22,7 +22,7 @@ from modp_ti.inputs.sources import FrameReader, ImageSource, Intrinsics, require
 from modp_ti.inputs.sources.image_header import focal_length_35mm
 
 if TYPE_CHECKING:
-    from modp_ti.config.settings import SourceSettings
+    from modp_ti.inputs.source_settings import SourceSettings
 
 CALIBRATION_FRAMES = 300
 CALIBRATION_STRIDE = 3

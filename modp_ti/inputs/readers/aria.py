@@ -25,7 +25,7 @@ from modp_ti.inputs.sources.protocol import ImageSource
 from modp_ti.inputs.timed_poses import require_rising
 
 if TYPE_CHECKING:
-    from modp_ti.config.settings import SourceSettings
+    from modp_ti.inputs.source_settings import SourceSettings
 
 CLOSED_LOOP, OPEN_LOOP = "closed_loop_trajectory.csv", "open_loop_trajectory.csv"
 CALIBRATION = "online_calibration.jsonl"

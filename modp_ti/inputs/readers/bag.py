@@ -22,8 +22,8 @@ from modp_ti.inputs.reader import PosesSettings
 from modp_ti.inputs.sources.protocol import ImageSource
 
 if TYPE_CHECKING:
-    from modp_ti.config.settings import SourceSettings
     from modp_ti.inputs.bags.images import BagImages
+    from modp_ti.inputs.source_settings import SourceSettings
 
 
 class BagSettings(PosesSettings):

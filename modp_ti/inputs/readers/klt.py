@@ -10,7 +10,7 @@ from modp_ti.inputs.protocol import Progress, Tracker
 from modp_ti.inputs.reader import TrackerSettings
 
 if TYPE_CHECKING:
-    from modp_ti.config.settings import SceneConfig
+    from modp_ti.inputs.source_settings import Scene
 
 
 class KltSettings(TrackerSettings):
@@ -40,7 +40,7 @@ class KltSettings(TrackerSettings):
             return self.maps
         return None if self.maps == "first" else 1
 
-    def open(self, scene: SceneConfig, progress: Progress | None = None) -> Tracker:
+    def open(self, scene: Scene, progress: Progress | None = None) -> Tracker:
         """Open the tracker, in a process of its own where it keeps pace with its images."""
         if scene.tracks_beside_mapping:
             from modp_ti.inputs.tracking_process import TrackingProcess

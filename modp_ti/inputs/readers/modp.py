@@ -27,7 +27,7 @@ from modp_ti.inputs.sources.image_folder import ImageFolder
 from modp_ti.inputs.sources.undistortion import Intrinsics
 
 if TYPE_CHECKING:
-    from modp_ti.config.settings import SourceSettings
+    from modp_ti.inputs.source_settings import SourceSettings
 
 # File names of the release, and those that it uses with ORB-SLAM3 as its tracker.
 POSES, POSES_ORB = "trajectory.json", "trajectory_orb.json"

@@ -21,7 +21,7 @@ from modp_ti.inputs.sources.image_folder import ListedImages, natural_key
 from modp_ti.inputs.sources.undistortion import Intrinsics
 
 if TYPE_CHECKING:
-    from modp_ti.config.settings import SourceSettings
+    from modp_ti.inputs.source_settings import SourceSettings
 
 IMAGES = "results"
 IMAGE = re.compile(r"results/(frame[0-9].*\.jpg)")

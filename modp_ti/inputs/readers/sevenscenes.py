@@ -20,7 +20,7 @@ from modp_ti.inputs.sources.image_folder import ListedImages
 from modp_ti.inputs.sources.undistortion import Intrinsics
 
 if TYPE_CHECKING:
-    from modp_ti.config.settings import SourceSettings
+    from modp_ti.inputs.source_settings import SourceSettings
 
 POSE_SUFFIX = ".pose.txt"
 # The data set calibrates only its depth camera (f = 585). These are approximate values for the sensor's colour camera.

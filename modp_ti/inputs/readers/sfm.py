@@ -24,8 +24,8 @@ from modp_ti.inputs.replay import Unreadable
 from modp_ti.inputs.sources import FrameReader, ImageSource, Intrinsics
 
 if TYPE_CHECKING:
-    from modp_ti.config.settings import SceneConfig, SourceSettings
     from modp_ti.inputs.multiview.structure import MatchedImage
+    from modp_ti.inputs.source_settings import Scene, SourceSettings
 
 # The fingerprint of what a kept model was made of. A change of the method must change METHOD.
 MADE_OF = "made_of.txt"
@@ -52,7 +52,7 @@ class SfmSettings(TrackerSettings):
     overlap: int = Field(default=10, ge=1, description="number of next images that an image is matched with")
     features: int = Field(default=4000, ge=100, description="largest number of features of an image")
 
-    def open(self, scene: SceneConfig, progress: Progress | None = None) -> Tracker:
+    def open(self, scene: Scene, progress: Progress | None = None) -> Tracker:
         """Reconstruct the selected images, or take the model of an earlier run on the same images and settings.
 
         The faces of a panorama are placed together, as a rig. The model is in `sfm` in the output folder: a COLMAP

@@ -11,7 +11,7 @@ from modp_ti.inputs.protocol import Progress, Tracker
 from modp_ti.inputs.reader import TrackerSettings
 
 if TYPE_CHECKING:
-    from modp_ti.config.settings import SceneConfig
+    from modp_ti.inputs.source_settings import Scene
 
 
 class SocketSettings(TrackerSettings):
@@ -39,7 +39,7 @@ class SocketSettings(TrackerSettings):
             raise ValueError("tracker.address and tracker.path cannot both be set; remove one of them")
         return self
 
-    def open(self, scene: SceneConfig, progress: Progress | None = None) -> Tracker:
+    def open(self, scene: Scene, progress: Progress | None = None) -> Tracker:
         """Listen at the address. Frames arrive once a sender has connected."""
         from modp_ti.inputs.tracker_server import open_tracker_server
 

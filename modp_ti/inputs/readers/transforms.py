@@ -23,7 +23,7 @@ from modp_ti.inputs.sources.image_folder import ListedImages
 from modp_ti.inputs.sources.undistortion import require_plausible
 
 if TYPE_CHECKING:
-    from modp_ti.config.settings import SourceSettings
+    from modp_ti.inputs.source_settings import SourceSettings
 
 NAME, WHAT = "transforms.json", "a transforms.json"
 PERSPECTIVE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")

@@ -21,7 +21,7 @@ from modp_ti.inputs.sources.image_folder import ListedImages
 from modp_ti.inputs.sources.undistortion import Intrinsics
 
 if TYPE_CHECKING:
-    from modp_ti.config.settings import SourceSettings
+    from modp_ti.inputs.source_settings import SourceSettings
 
 NAMES = ("groundtruth.txt", "trajectory.txt", "CameraTrajectory.txt", "KeyFrameTrajectory.txt")
 LISTING = "rgb.txt"

@@ -20,7 +20,7 @@ from modp_ti.inputs.sources.protocol import ImageSource
 from modp_ti.inputs.sources.undistortion import Intrinsics
 
 if TYPE_CHECKING:
-    from modp_ti.config.settings import VrsSettings
+    from modp_ti.inputs.source_settings import VrsSettings
 
 RGB = "camera-rgb"
 

@@ -21,7 +21,7 @@ from modp_ti.inputs.sources.protocol import ImageSource
 from modp_ti.inputs.sources.undistortion import Undistorter, both_valid
 
 if TYPE_CHECKING:
-    from modp_ti.config.settings import SourceSettings
+    from modp_ti.inputs.source_settings import SourceSettings
 
 VALID_FROM = 128  # grey value
 # Pixels that get a smaller share of the light than this are mostly noise and are masked.

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.geometry.camera import PinholeCamera
-from modp_ti.config.camera_settings import PanoramaSettings
 from modp_ti.files.errors import InputError, UnreadableImageError
+from modp_ti.inputs.source_settings import PanoramaSettings
 from modp_ti.inputs.sources.protocol import ImageSource
 from modp_ti.inputs.sources.undistortion import Intrinsics
 

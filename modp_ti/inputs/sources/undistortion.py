@@ -15,7 +15,7 @@ from modp_ti.files.errors import InputError
 from modp_ti.inputs.sources.distortion import NO_DISTORTION, Distortion
 
 if TYPE_CHECKING:
-    from modp_ti.config.settings import IntrinsicsSettings
+    from modp_ti.inputs.source_settings import IntrinsicsSettings
 
 # The inverse of the lens model is searched up to this multiple of the image corner's radius.
 SEARCH_MARGIN = 1.5

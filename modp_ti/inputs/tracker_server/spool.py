@@ -36,7 +36,7 @@ from modp_ti.inputs.tracker_server.messages import (
 )
 
 if TYPE_CHECKING:
-    from modp_ti.config.settings import SourceSettings
+    from modp_ti.inputs.source_settings import SourceSettings
 
 
 class SpoolFullError(Exception):

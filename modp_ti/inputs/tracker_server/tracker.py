@@ -45,8 +45,8 @@ from modp_ti.inputs.tracker_server.ordering import Ordering
 from modp_ti.inputs.tracker_server.spool import Spool, SpoolFullError, is_stream
 
 if TYPE_CHECKING:
-    from modp_ti.config.settings import SourceSettings
     from modp_ti.inputs.readers.socket import SocketSettings
+    from modp_ti.inputs.source_settings import SourceSettings
 
 # What the server has received, in order; None at its end. Images and points of frames are in the spool.
 _Waiting = Frame | PoseCorrection | InputError | None

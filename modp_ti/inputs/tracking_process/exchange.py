@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.frames.tracked_frame import TrackedFrame
-from modp_ti.config.settings import SceneConfig
 from modp_ti.files.errors import InputError, UnreadableImageError
 from modp_ti.inputs.protocol import LiveCounts
+from modp_ti.inputs.source_settings import Scene
 from modp_ti.inputs.sources import Intrinsics
 
 # Numbers of a `CountsBoard`: the counts, the number of frames, the wish to finish, and whether the stream goes on.
@@ -29,7 +29,7 @@ NUMBERS = 8
 class Job:
     """To the child: what to track. A live source stores its frames in `folder`, which belongs to the parent."""
 
-    config: SceneConfig
+    config: Scene
     folder: Path | None
 
 

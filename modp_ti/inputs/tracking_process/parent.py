@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
-from modp_ti.config.settings import SceneConfig
 from modp_ti.files.errors import InputError, UnreadableImageError
 from modp_ti.files.processes import RecordingInterrupt, child_environment, withheld
 from modp_ti.inputs.opening import open_source
 from modp_ti.inputs.protocol import Event, LiveCounts, Progress, Tracker
 from modp_ti.inputs.replay import pictures_again
+from modp_ti.inputs.source_settings import Scene
 from modp_ti.inputs.sources import FrameReader, Picture, Undistorter
 from modp_ti.inputs.sources.live import StoredFrames, kept_frames
 from modp_ti.inputs.tracking_process.exchange import (
@@ -59,7 +59,7 @@ class TrackingProcess(Tracker):
 
     corrects: ClassVar[bool] = True
 
-    def __init__(self, config: SceneConfig, progress: Progress | None = None) -> None:
+    def __init__(self, config: Scene, progress: Progress | None = None) -> None:
         self._config = config
         self._vignette: NDArray[np.float32] | None = None
         self._taken = 0  # frames
@@ -155,7 +155,7 @@ class TrackingProcess(Tracker):
 
     def pictures(self, names: Sequence[str]) -> Iterator[tuple[str, Picture]]:
         if self._kept is None:
-            images = open_source(self._config.without_clock().source)
+            images = open_source(self._config.source.model_copy(update={"realtime": False}))
         else:
             images = StoredFrames(Path(self._kept.name), names)
         with closing(images):
@@ -225,7 +225,7 @@ def _started(descriptors: list[int]) -> subprocess.Popen[bytes]:
         )
 
 
-def _shared_cores(config: SceneConfig) -> str:
+def _shared_cores(config: Scene) -> str:
     threads = config.mapper_threads
     mapper = "a thread for each core" if threads is None else "1 thread" if threads == 1 else f"{threads} threads"
     return f"the tracker has a process of its own with one core, the mapper {mapper} (`threads`)"

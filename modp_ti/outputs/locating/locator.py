@@ -17,7 +17,7 @@ from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from fields.runtime.tenancy import Tenant
 from modp_ti.config.scene_file import scene_from_data
-from modp_ti.config.settings import IntrinsicsSettings
+from modp_ti.inputs.source_settings import IntrinsicsSettings
 from modp_ti.inputs.sources.image_folder import ListedImages
 from modp_ti.inputs.sources.undistortion import Intrinsics, given_intrinsics
 from modp_ti.outputs.locating.search import MapViews, Search, map_depth

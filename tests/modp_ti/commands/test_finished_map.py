@@ -15,8 +15,8 @@ from plyfile import PlyData
 from typer.testing import CliRunner, Result
 
 from modp_ti.commands.app import app
-from modp_ti.config.settings import SourceSettings
 from modp_ti.inputs.readers.transforms import TransformsSettings
+from modp_ti.inputs.source_settings import SourceSettings
 from modp_ti.outputs.formats.run_files import write_exposures
 from modp_ti.outputs.formats.splats_ply import read_splats
 from modp_ti.outputs.formats.trajectory import read_trajectory, write_trajectory

@@ -10,11 +10,10 @@ import yaml
 from pydantic import ValidationError
 
 from modp_ti.config.__main__ import reference
-from modp_ti.config.combinations import EXCLUSIONS, used_settings
 from modp_ti.config.keys import documented_keys, documented_values, dotted_keys, leaves, variants_of
 from modp_ti.config.presets import PRESETS, with_defaults
 from modp_ti.config.scene_file import dump_scene, load_scene, scene_from_data
-from modp_ti.config.settings import SceneConfig
+from modp_ti.config.settings import EXCLUSIONS, SceneConfig, used_settings
 from modp_ti.files.errors import InputError
 
 KINDS = list(variants_of(SceneConfig.model_fields["tracker"]))

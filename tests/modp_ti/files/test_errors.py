@@ -17,8 +17,8 @@ from typer.testing import CliRunner
 from modp_ti.commands.app import app
 from modp_ti.commands.shared import outcome
 from modp_ti.config.scene_file import dump_scene, load_scene, scene_from_data
-from modp_ti.config.settings import WITH_SECRETS
 from modp_ti.files.errors import InputError, actual_url, shown_url, without_secrets
+from modp_ti.inputs.source_settings import WITH_SECRETS
 from modp_ti.many.batch import with_resources
 from modp_ti.many.pool import Resources
 from modp_ti.outputs.report.facts import changed_settings

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from fields.frames.origin import far_origin, shifted
+from modp_ti.config.bare_recording import recorded_scene
 from modp_ti.config.keys import variants_of
 from modp_ti.config.settings import SceneConfig
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.bare_recording import recorded_scene
 from modp_ti.inputs.opening import open_source, open_tracker, recognised_kind
 from modp_ti.inputs.readers import READERS
 from tests.opening import CAPTURES, opened

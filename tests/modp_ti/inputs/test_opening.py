@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from modp_ti.config.scene_file import load_scene
-from modp_ti.config.settings import IntrinsicsSettings, SourceSettings
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.opening import open_source, recognised_kind
+from modp_ti.inputs.source_settings import IntrinsicsSettings, SourceSettings
 from modp_ti.inputs.sources import ImageFolder, require_intrinsics
 
 

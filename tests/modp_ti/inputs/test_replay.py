@@ -11,12 +11,12 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from fields.geometry.camera import PinholeCamera
-from modp_ti.config.settings import SourceSettings
 from modp_ti.files.errors import InputError
 from modp_ti.files.trajectory import checked_pose
 from modp_ti.inputs.readers.colmap import ColmapSettings
 from modp_ti.inputs.readers.transforms import TransformsSettings
 from modp_ti.inputs.replay import points_inside
+from modp_ti.inputs.source_settings import SourceSettings
 from modp_ti.inputs.sources import Undistorter
 from tests.opening import opened_with
 

@@ -11,12 +11,12 @@ import pytest
 from rosbags.typesys import get_types_from_msg
 from scipy.spatial.transform import Rotation
 
-from modp_ti.config.settings import SourceSettings
+from modp_ti.config.bare_recording import recorded_scene
 from modp_ti.files.errors import InputError
 from modp_ti.inputs import posed_recording
 from modp_ti.inputs.bags import has_poses, is_bag
-from modp_ti.inputs.bare_recording import recorded_scene
 from modp_ti.inputs.opening import open_source
+from modp_ti.inputs.source_settings import SourceSettings
 from tests.samples.bags import BODY_CAMERA, FORMS, START, STEP, Messages, recording, write_bag
 
 PLANE = np.stack(np.meshgrid(np.linspace(-3, 3, 40), np.linspace(-3, 3, 40), [0.0]), axis=-1).reshape(-1, 3)

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from modp_ti.config.settings import SourceSettings
+from modp_ti.config.bare_recording import recorded_scene
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.bare_recording import recorded_scene
 from modp_ti.inputs.opening import open_source
+from modp_ti.inputs.source_settings import SourceSettings
 from tests.opening import read_capture
 from tests.samples.captures import KITTI_OFFSET, WRITERS, exr_file, lzfse_stored, zipped
 from tests.samples.filmed import View

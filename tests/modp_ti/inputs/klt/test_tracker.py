@@ -12,12 +12,12 @@ import pytest
 
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
-from modp_ti.config.settings import IntrinsicsSettings, SourceSettings
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.delivered_frames import settled
 from modp_ti.inputs.klt import KltTracker, open_klt
 from modp_ti.inputs.klt.opening import estimated_intrinsics
 from modp_ti.inputs.readers.klt import KltSettings
+from modp_ti.inputs.source_settings import IntrinsicsSettings, SourceSettings
 from modp_ti.inputs.sources import FrameReader, ImageFolder, Intrinsics
 from modp_ti.outputs.evaluation import absolute_trajectory_error
 from tests.modp_ti.inputs.klt.conftest import Walk, turning_walk

@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 import pytest
 
-from modp_ti.config.settings import SourceSettings, VrsSettings
 from modp_ti.inputs.opening import open_source
+from modp_ti.inputs.source_settings import SourceSettings, VrsSettings
 from modp_ti.inputs.sources import FrameReader
 
 needs_library = pytest.mark.skipif(

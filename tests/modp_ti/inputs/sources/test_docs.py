@@ -12,8 +12,8 @@ import pytest
 import yaml
 
 from modp_ti.config.scene_file import load_scene
-from modp_ti.config.settings import SourceSettings
 from modp_ti.inputs.opening import open_source, recognised_kind
+from modp_ti.inputs.source_settings import SourceSettings
 
 PAGE = Path(__file__).resolve().parents[4] / "docs" / "sources.md"
 EXAMPLES = dict(re.findall(r"^## ([^\n]+)\n\n```yaml\n(.*?)```", PAGE.read_text(), re.DOTALL | re.MULTILINE))

@@ -10,8 +10,8 @@ import pytest
 from PIL import Image
 
 from fields.geometry.camera import PinholeCamera
-from modp_ti.config.settings import SourceSettings
 from modp_ti.files.errors import InputError
+from modp_ti.inputs.source_settings import SourceSettings
 from modp_ti.inputs.sources import Distortion, FrameReader, ImageFolder, Undistorter
 
 WIDTH, HEIGHT = 64, 48

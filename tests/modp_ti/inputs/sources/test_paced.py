@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from modp_ti.config.settings import SourceSettings
 from modp_ti.inputs.opening import open_source
+from modp_ti.inputs.source_settings import SourceSettings
 from modp_ti.inputs.sources import ImageFolder
 from modp_ti.inputs.sources.paced import PacedSource
 

@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from fields.geometry.camera import PinholeCamera
-from modp_ti.config.camera_settings import PanoramaSettings
-from modp_ti.config.settings import SourceSettings
+from modp_ti.config.bare_recording import recorded_scene
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.bare_recording import recorded_scene
 from modp_ti.inputs.opening import is_panoramic, open_source, require_pinhole
+from modp_ti.inputs.source_settings import PanoramaSettings, SourceSettings
 from modp_ti.inputs.sources.panorama import Projection, faces_of, looks_panoramic, projection_of
 from tests.panoramas import equirectangular_rays, fisheye_rays
 

@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 from av.stream import Disposition
 
-from modp_ti.config.settings import SourceSettings
+from modp_ti.config.bare_recording import is_recording
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.bare_recording import is_recording
 from modp_ti.inputs.opening import open_source
+from modp_ti.inputs.source_settings import SourceSettings
 from modp_ti.inputs.sources import VideoFile
 
 FRAMES, FPS = 40, 12.5

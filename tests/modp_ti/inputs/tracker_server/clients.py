@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from fields.frames.tracked_frame import TrackedFrame
-from modp_ti.config.settings import SourceSettings
 from modp_ti.inputs.protocol import Event
 from modp_ti.inputs.readers.socket import SocketSettings
+from modp_ti.inputs.source_settings import SourceSettings
 from modp_ti.inputs.tracker_server import TrackerServer, open_tracker_server
 from tests.patience import PATIENCE
 

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from modp_ti.config.scene_file import load_scene
-from modp_ti.config.settings import SourceSettings
 from modp_ti.engine.session import run_scene
 from modp_ti.inputs.readers.socket import SocketSettings
+from modp_ti.inputs.source_settings import SourceSettings
 from modp_ti.inputs.tracker_server import open_tracker_server
 from tests.modp_ti.runs import SHORT_RUN
 from tests.patience import PATIENCE

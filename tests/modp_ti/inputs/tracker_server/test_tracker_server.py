@@ -16,11 +16,11 @@ import pytest
 
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
-from modp_ti.config.settings import SourceSettings
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.protocol import Tracker
 from modp_ti.inputs.readers.colmap import ColmapSettings
 from modp_ti.inputs.readers.socket import SocketSettings
+from modp_ti.inputs.source_settings import SourceSettings
 from modp_ti.inputs.tracker_server import open_tracker_server
 from tests.modp_ti.inputs.tracker_server.clients import (
     CORRECTION,

@@ -13,10 +13,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from modp_ti.config.settings import SourceSettings
 from modp_ti.inputs.readers.colmap import ColmapSettings
 from modp_ti.inputs.readers.transforms import TransformsSettings
 from modp_ti.inputs.replay import PosedImage, ReplayedTracker
+from modp_ti.inputs.source_settings import SourceSettings
 from tests.opening import opened_with
 
 pytestmark = pytest.mark.real_data

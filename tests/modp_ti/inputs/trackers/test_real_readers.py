@@ -15,12 +15,12 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from modp_ti.config.settings import IntrinsicsSettings, SourceSettings
 from modp_ti.inputs.readers.aria import AriaSettings
 from modp_ti.inputs.readers.sevenscenes import SevenScenesSettings
 from modp_ti.inputs.readers.stella_vslam import StellaVslamSettings
 from modp_ti.inputs.readers.tum import TumSettings
 from modp_ti.inputs.replay import PosedImage, ReplayedTracker
+from modp_ti.inputs.source_settings import IntrinsicsSettings, SourceSettings
 from tests.opening import opened_with
 
 

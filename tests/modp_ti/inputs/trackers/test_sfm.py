@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from fields.geometry.se3 import camera_centres, exp_se3, inverse_se3
-from modp_ti.config.settings import IntrinsicsSettings, SourceSettings
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.readers import sfm
 from modp_ti.inputs.readers.sfm import SfmSettings
+from modp_ti.inputs.source_settings import IntrinsicsSettings, SourceSettings
 from modp_ti.outputs.evaluation import umeyama
 from tests.opening import opened_with
 from tests.panoramas import equirectangular_rays, panorama, stroll

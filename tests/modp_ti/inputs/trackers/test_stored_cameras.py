@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from modp_ti.config.settings import SourceSettings
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.protocol import Tracker
 from modp_ti.inputs.readers.colmap import ColmapSettings
 from modp_ti.inputs.readers.transforms import TransformsSettings
+from modp_ti.inputs.source_settings import SourceSettings
 from tests.modp_ti.conftest import PlaneScene
 from tests.opening import opened_with
 

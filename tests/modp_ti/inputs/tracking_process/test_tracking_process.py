@@ -16,10 +16,11 @@ import pytest
 
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
-from modp_ti.config.settings import SceneConfig, SourceSettings
+from modp_ti.config.settings import SceneConfig
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.klt import open_klt
 from modp_ti.inputs.opening import open_source, open_tracker
+from modp_ti.inputs.source_settings import SourceSettings
 from modp_ti.inputs.sources import FrameReader
 from modp_ti.inputs.sources.live import list_frames
 from modp_ti.inputs.tracking_process import TrackingProcess

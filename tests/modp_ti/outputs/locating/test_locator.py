@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from fields.geometry.se3 import exp_se3, inverse_se3
-from modp_ti.config.settings import IntrinsicsSettings
+from modp_ti.inputs.source_settings import IntrinsicsSettings
 from modp_ti.outputs.locating.locator import Location, Locator
 from tests.modp_ti.outputs.locating.painted_room import CAMERA, another_room, photograph, write_run
 from tests.room import Room, walk

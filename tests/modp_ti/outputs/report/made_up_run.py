@@ -15,10 +15,11 @@ from scipy.spatial.transform import Rotation
 
 from fields.frames.tracked_frame import TrackedFrame
 from fields.geometry.camera import PinholeCamera
-from modp_ti.config.settings import ExportSettings, SceneConfig, SourceSettings
+from modp_ti.config.settings import ExportSettings, SceneConfig
 from modp_ti.engine.results import metrics_of
 from modp_ti.inputs.delivered_frames import DeliveredFrames
 from modp_ti.inputs.readers.transforms import TransformsSettings
+from modp_ti.inputs.source_settings import SourceSettings
 from modp_ti.outputs.evaluation import FrameScore, MapVersion
 from modp_ti.outputs.report.page import Album, ReportedRun
 from modp_ti.outputs.report.record import RunRecord, StepNote, retention

@@ -11,9 +11,10 @@ import pytest
 from fields.frames.tracked_frame import SparsePoints
 from fields.map.keyframe import Keyframe
 from fields.map.keyframes import KeyframeStore
-from modp_ti.config.settings import SceneConfig, SourceSettings
+from modp_ti.config.settings import SceneConfig
 from modp_ti.inputs.opening import open_tracker
 from modp_ti.inputs.readers.colmap import ColmapSettings
+from modp_ti.inputs.source_settings import SourceSettings
 from pipelines.densify.depth.epipolar import EpipolarDepth
 from pipelines.densify.depth.estimate import DepthEstimator, FusedDepth, point_depths
 from pipelines.densify.depth.gaussian_process import GaussianProcessDepth, ImageGuidedDepth

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from modp_ti.config.scene_file import load_scene
+from modp_ti.config.scene_paths import refuse_output_in_input
 from modp_ti.files.errors import InputError
 from modp_ti.files.run_folder import appearing
 from modp_ti.inputs.opening import open_source
-from modp_ti.inputs.scene_paths import refuse_output_in_input
 from tests.modp_ti.runs import check, run
 
 COLMAP = (

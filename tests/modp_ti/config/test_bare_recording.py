@@ -10,10 +10,10 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from modp_ti.commands import app as cli
+from modp_ti.config.bare_recording import recorded_scene, streamed_scene
 from modp_ti.config.presets import PRESETS
 from modp_ti.config.scene_file import dump_scene, load_scene
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.bare_recording import recorded_scene, streamed_scene
 
 
 @pytest.fixture(autouse=True)
