@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from functools import partial, wraps
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,48 +75,30 @@ def verdict(findings: Iterable[Finding]) -> tuple[str, int]:
     return ("warnings", 1) if Severity.WARNING in severities else ("fine", 0)
 
 
-def _each_view(check: Callable[[Sequence[FrameRecord]], list[int]]) -> Callable[[Sequence[FrameRecord]], list[int]]:
-    """Apply a check to the frames of each view of a rig by themselves, and return the indices of all frames found."""
+def faulty_frames(frames: Sequence[FrameRecord]) -> dict[str, list[int]]:
+    """Indices of faulty frames, where each view of a rig is judged by itself.
 
-    @wraps(check)
-    def checked(frames: Sequence[FrameRecord]) -> list[int]:
-        views = frames[0].views if frames else 1
-        return sorted(view + views * i for view in range(views) for i in check(frames[view::views]))
-
-    return checked
-
-
-@_each_view
-def blurred(frames: Sequence[FrameRecord]) -> list[int]:
-    """Indices of frames that are less sharp than their neighbours."""
-    sharp = np.array([frame.sharpness for frame in frames])
-    result = []
-    for i, value in enumerate(sharp):
-        around = np.delete(sharp[max(0, i - AROUND) : i + AROUND + 1], min(i, AROUND))
-        if len(around) and value < BLURRED * np.median(around):
-            result.append(i)
-    return result
-
-
-@_each_view
-def duplicates(frames: Sequence[FrameRecord]) -> list[int]:
-    """Indices of frames whose image repeats the one before."""
-    return [i for i, frame in enumerate(frames) if frame.change < SAME and frame.masked < 1]
-
-
-@_each_view
-def time_gaps(frames: Sequence[FrameRecord]) -> list[int]:
-    """Indices of frames that follow a gap in time."""
-    steps = np.diff([frame.timestamp for frame in frames])
-    if len(steps) == 0 or np.median(steps) <= 0:
-        return []
-    return (np.flatnonzero(steps > GAP * np.median(steps)) + 1).tolist()
-
-
-@_each_view
-def _steps_back(frames: Sequence[FrameRecord]) -> list[int]:
-    """Indices of frames that are not later than the one before."""
-    return (np.flatnonzero(np.diff([frame.timestamp for frame in frames]) <= 0) + 1).tolist()
+    Returns:
+        By fault: `blurred`, less sharp than their neighbours; `duplicates`, whose image repeats the one before;
+        `time_gaps`, which follow a gap in time; `time_order`, which are not later than the one before.
+    """
+    found: dict[str, list[int]] = {"time_order": [], "time_gaps": [], "blurred": [], "duplicates": []}
+    views = frames[0].views if frames else 1
+    for view in range(views):
+        own = frames[view::views]
+        sharp, steps = np.array([frame.sharpness for frame in own]), np.diff([frame.timestamp for frame in own])
+        usual = np.median(steps) if len(steps) else 0.0
+        for i, frame in enumerate(own):
+            around = np.delete(sharp[max(0, i - AROUND) : i + AROUND + 1], min(i, AROUND))
+            faults = {
+                "time_order": i > 0 and steps[i - 1] <= 0,
+                "time_gaps": i > 0 and usual > 0 and steps[i - 1] > GAP * usual,
+                "blurred": len(around) > 0 and sharp[i] < BLURRED * np.median(around),
+                "duplicates": frame.change < SAME and frame.masked < 1,
+            }
+            for fault in (name for name, is_so in faults.items() if is_so):
+                found[fault].append(view + views * i)
+    return {fault: sorted(indices) for fault, indices in found.items()}
 
 
 def judge_sequence(frames: Sequence[FrameRecord]) -> Iterator[Finding]:
@@ -124,19 +106,20 @@ def judge_sequence(frames: Sequence[FrameRecord]) -> Iterator[Finding]:
     sizes = sorted({(frame.camera.width, frame.camera.height) for frame in frames})
     if len(sizes) > 1:
         yield note("sizes", f"images of several sizes: {', '.join(f'{w}x{h}' for w, h in sizes)}")
-    back = _steps_back(frames)
-    if len(back):
+    faulty = faulty_frames(frames)
+    back, gaps = faulty["time_order"], faulty["time_gaps"]
+    if back:
         text = f"time does not go on at {len(back)} frames: {_names(frames, back)}"
         yield warning("time_order", text, "sort the frames by time, or mend the times")
-    gaps = time_gaps(frames)
     if gaps:
         yield note("time_gaps", f"{len(gaps)} gaps in time, before {_names(frames, gaps)}")
     slower = "record slower or with more light, or leave these frames out"
     fewer = "take them out, or use source.step"
-    for code, found, most, what, mend in (
-        ("blurred", blurred(frames), MANY_BLURRED, "are blurred", slower),
-        ("duplicates", duplicates(frames), MANY_DUPLICATES, "repeat the one before", fewer),
+    for code, most, what, mend in (
+        ("blurred", MANY_BLURRED, "are blurred", slower),
+        ("duplicates", MANY_DUPLICATES, "repeat the one before", fewer),
     ):
+        found = faulty[code]
         text = f"{len(found)} of {len(frames)} frames {what}: {_names(frames, found)}"
         if len(found) > most * len(frames):
             yield warning(code, text, mend)

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from modp_ti.inputs.inspection.conventions import CONVENTIONS
-from modp_ti.inputs.inspection.findings import Finding, Scale, blurred, duplicates, time_gaps, verdict
+from modp_ti.inputs.inspection.findings import Finding, Scale, faulty_frames, verdict
 from modp_ti.inputs.inspection.geometry import Geometry
 from modp_ti.inputs.inspection.survey import FrameRecord
 
@@ -34,7 +34,7 @@ def measured(frames: Sequence[FrameRecord], geometry: Geometry, scale: Scale, le
         scale: Depth of the scene and motion of the camera.
         lens: The lens distortion in words.
     """
-    camera = frames[0].camera
+    camera, faulty = frames[0].camera, faulty_frames(frames)
     points = np.array([frame.points for frame in frames])
     steps = np.diff([frame.timestamp for frame in frames])
     return {
@@ -47,7 +47,7 @@ def measured(frames: Sequence[FrameRecord], geometry: Geometry, scale: Scale, le
         "masked": _number(np.mean([frame.masked for frame in frames])),
         "seconds": _number(frames[-1].timestamp - frames[0].timestamp),
         "seconds_between_frames": _number(np.median(steps)) if len(steps) else None,
-        **{check.__name__: [frames[i].name for i in check(frames)] for check in (time_gaps, blurred, duplicates)},
+        **{fault: [frames[i].name for i in faulty[fault]] for fault in ("time_gaps", "blurred", "duplicates")},
         "points": {"median": int(np.median(points)), "least": int(points.min()), "most": int(points.max())},
         "scale": {
             "depth": _number(scale.depth),
