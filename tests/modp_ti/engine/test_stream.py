@@ -157,3 +157,14 @@ def test_the_first_frame_stays_the_next_one(ahead: int) -> None:
             frames.first_frame()
     with FramesAhead(Source(3, bad=0), ahead) as frames, pytest.raises(InputError, match="damaged"):
         frames.first_frame()
+
+
+def test_an_error_ends_the_wait_for_a_frame_that_is_still_to_come() -> None:
+    ended = threading.Event()
+
+    def live() -> Iterator[TrackedFrame]:
+        assert ended.wait(timeout=PATIENCE)
+        yield from ()
+
+    with pytest.raises(KeyError), FramesAhead(live(), 1, ended.set):
+        raise KeyError("Ctrl-C")
