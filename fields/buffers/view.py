@@ -43,13 +43,7 @@ class ViewField:
         self.height = 0
 
     def set(self, camera: PinholeCamera, T_camera_world: ArrayLike, near: float) -> None:
-        """Set the view.
-
-        Args:
-            camera: Intrinsics.
-            T_camera_world: Pose (4, 4).
-            near: Depth below which nothing is drawn [scene units].
-        """
+        """Set the view."""
         T = np.asarray(T_camera_world, dtype=np.float64)
         fx, fy, cx, cy, width, height = camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height
         margin_x, margin_y = FRUSTUM_MARGIN * 0.5 * width / fx, FRUSTUM_MARGIN * 0.5 * height / fy

@@ -60,9 +60,6 @@ def keyframe_arrays(store: Iterable[Keyframe]) -> dict[str, NDArray]:
 class KeyframeRows:
     """Restores the keyframes of `keyframe_arrays` into a store, frame by frame.
 
-    Args:
-        arrays: Result of `keyframe_arrays`.
-
     Attributes:
         rows: Row of each keyframe, by frame index.
     """

@@ -231,11 +231,6 @@ def growing(builder: ti.FieldsBuilder, blocks: int) -> ti.SNode:
 def sparse(parent: ti.FieldsBuilder | ti.SNode, axes: list, shape: Sequence[int]) -> ti.SNode:
     """Create a sparse SNode below another one.
 
-    Args:
-        parent: The other one.
-        axes: Its axes.
-        shape: Its size along them.
-
     Raises:
         RuntimeError: If there are more than the engine supports in a process.
     """
@@ -251,11 +246,6 @@ def place(fields: Sequence[ti.Field], blocks: ti.SNode, *shape: int) -> None:
     On the CPU, the values of an element lie side by side, in one child. On a GPU, where neighbouring threads read
     neighbouring elements, each field has a child of its own: Adam on 500,000 Gaussians takes an H100 0.12 ms instead
     of 0.35.
-
-    Args:
-        fields: The fields.
-        blocks: Result of `growing`.
-        shape: Shape of a block.
     """
     for together in [[each] for each in fields] if on_gpu() else [fields]:
         child = blocks

@@ -26,9 +26,6 @@ class HashedBricks(Bricks):
     bits, because many of these devices have no atomic operations on 64 bits. `_table` has two places for each row and
     holds row numbers: a brick is at the hash of its corner, or after it without a gap. All three are dense arrays that
     are passed to the kernels, so that they can grow between launches without compiling a kernel again.
-
-    Args:
-        levels: Number of levels.
     """
 
     def __init__(self, levels: int) -> None:

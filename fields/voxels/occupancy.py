@@ -23,9 +23,6 @@ class RestingBricks:
 
     All bricks within a region rest together.
 
-    Args:
-        bricks: The bricks in use.
-
     Attributes:
         count: Number of words that rest.
     """

@@ -40,9 +40,6 @@ class SparseBricks(Bricks):
     through the multiprocessor's own cache, which may still hold that of a node without children; the write then goes to
     the element that stands for all inactive ones. On an H100, 3 of 2,265 words were lost so, and other bricks seemed to
     be marked. Hence the bricks of a batch are activated before, level by level.
-
-    Args:
-        levels: Number of levels.
     """
 
     NODES = len(POINTERS)

@@ -37,13 +37,6 @@ class ChangeSweep(Companion):
     Keyframes of both visits ask for the place as they saw it, so that the map would become a mixture. Where they
     contradict each other, the later ones are right. What the earlier ones saw is read from the map that they made,
     which is kept unchanged: the map that is optimised on both is between them.
-
-    Args:
-        earlier: The map of the earlier visit.
-        gaussians: The Gaussians of the map.
-        keyframes: The keyframes of both visits.
-        renderer: Renderer of the map.
-        paging: Keeps the part of the map that is on disk.
     """
 
     def __init__(
@@ -120,12 +113,7 @@ class ChangeSweep(Companion):
 
 
 class Changes:
-    """What views of a later visit tell about surfaces, of the map as it is now and as it was then.
-
-    Args:
-        now: The views compared with the present map.
-        then: The same views compared with the map of the earlier visit.
-    """
+    """What views of a later visit tell about surfaces, of the map as it is now and as it was then."""
 
     def __init__(self, now: Sequence[CoarseView], then: Sequence[CoarseView]) -> None:
         # A surface of the earlier map that is hidden by a new one may still be there.

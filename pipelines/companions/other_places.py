@@ -26,9 +26,6 @@ class OtherPlaces(Companion):
     until they fill these: a Gaussian of redkitchen grew from 0.2 to 9.5 scene depths within ten keyframes of a copy 15
     depths away, and its own views lost up to 7 dB. Gaussians also grow until they fill a hole at their own place, where
     no view may show that they are too large: one of 4.2 scene depths veiled the copy beside it, which lost 0.7 dB.
-
-    Args:
-        densifier: Owner of the map's Gaussians and keyframes, and of the anchors.
     """
 
     def __init__(self, densifier: Densifier) -> None:

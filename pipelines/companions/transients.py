@@ -272,14 +272,7 @@ def neighbours(place: int, count: int) -> list[int]:
 
 
 class TransientSweep(Companion):
-    """Masks what moves in keyframes, and removes its Gaussians.
-
-    Args:
-        gaussians: The Gaussians of the map.
-        keyframes: The keyframes of the map.
-        renderer: Renderer of the map.
-        paging: Keeps the part of the map that is on disk.
-    """
+    """Masks what moves in keyframes, and removes its Gaussians."""
 
     def __init__(self, gaussians: GaussianField, keyframes: KeyframeStore, renderer: Renderer, paging: Paging) -> None:
         self.gaussians = gaussians

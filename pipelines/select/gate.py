@@ -74,10 +74,6 @@ class FrameGate:
       render of the map at the new pose matches the image less well than the render at the last accepted pose. A
       camera that does move elsewhere loses at most one frame.
 
-    Args:
-        settings: Settings of the gate.
-        trajectory: Tracked poses of the frames so far.
-
     Attributes:
         refused: Number of rejected frames by reason.
     """

@@ -24,10 +24,6 @@ class KeyframeSelector:
     frame is rejected only if its image is blurred as well. In a collection of photographs, large rotations between
     sharp images are common, and rejecting them would leave parts of the scene unmapped.
 
-    Args:
-        settings: Settings of the selection.
-        trajectory: Tracked poses of the frames so far.
-
     Attributes:
         previous: Index of the previous frame; None before the first one.
     """

@@ -76,9 +76,6 @@ def choose_neighbours(views: Sequence[DepthView], index: int) -> list[int]:
 class DepthMatcher:
     """Matches views with their neighbours. The engine must have been started.
 
-    Args:
-        views: All views.
-
     Attributes:
         neighbours: Indices of the neighbours of each view.
     """

@@ -52,10 +52,6 @@ class FreeSpace:
     The sum of alpha T / D, where D is the depth of the surface, then tells the mean inverse depth of the surface where
     the Gaussian is. Both are derivatives of weighted sums of the picture's colours by the Gaussian's colour, and come
     from one backward pass of compositing.
-
-    Args:
-        renderer: Renderer of the Gaussians.
-        near: Depth below which nothing is drawn [scene units].
     """
 
     def __init__(self, renderer: Renderer, near: float) -> None:
