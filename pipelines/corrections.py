@@ -199,11 +199,7 @@ def revise(store: KeyframeStore, correction: PoseCorrection) -> dict[int, NDArra
     """Apply a correction to the tracked poses of all frames, and to the poses, points, depths and camera of keyframes.
 
     Corrected frames take the pose that the correction names, and all others move with the world around them unless they
-    stay. The Gaussians are not moved.
-
-    Args:
-        store: The keyframes, with the trajectory. Corrected frames that it does not contain are ignored.
-        correction: The correction.
+    stay. Corrected frames without a tracked pose are ignored. The Gaussians are not moved.
 
     Returns:
         Similarity S_after_before (4, 4) of the world around each frame whose world moved, by index.

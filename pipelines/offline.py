@@ -93,17 +93,10 @@ class Schedule:
 
 
 def scene_extent(store: KeyframeStore) -> float:
-    """Extent of a scene, the unit of length of 3DGS's settings.
+    """Extent of a scene, the unit of length of 3DGS's settings [scene units].
 
-    Args:
-        store: All views.
-
-    Returns:
-        1.1 times the largest distance of a camera from the mean camera centre, and at least `LEAST_EXTENT` scene depths
-        [scene units].
-
-    Raises:
-        ValueError: If there is no view.
+    This is 1.1 times the largest distance of a camera from the mean camera centre, and at least `LEAST_EXTENT` scene
+    depths. Raises ValueError if there is no view.
     """
     if len(store) == 0:
         raise ValueError("there is no frame to map")
@@ -162,11 +155,7 @@ class OfflineMapper(Pipeline):
             initialise(self.gaussians, points, self.settings.initial_opacity, LEAST_SIZE * extent)
 
     def optimise(self, progress: Callable[[int, int, float], None] | None = None) -> None:
-        """Run all optimisation steps on an initialised map.
-
-        Args:
-            progress: Called after every step with (steps done, number of Gaussians, PSNR of its view).
-        """
+        """Run all steps on an initialised map, and report each as (steps done, Gaussians, PSNR of its view)."""
         schedule, extent = Schedule.of(self.settings), scene_extent(self.keyframes)
         views: list[int] = []
         for step in range(1, schedule.steps + 1):

@@ -177,11 +177,7 @@ class OnlineMapper(Pipeline):
         return FrameReport(frame.index, is_keyframe, keyframes, self.gaussian_count, psnr, steps)
 
     def optimise(self, steps: int, level: int = 0) -> float | None:
-        """Optimise the map on the last keyframe and the views selected with it.
-
-        Args:
-            steps: Number of optimisation steps.
-            level: Pyramid level of the images.
+        """Make steps on the last keyframe and the views selected with it, on a pyramid level.
 
         Returns:
             Mean PSNR of the last step; None if nothing was optimised.

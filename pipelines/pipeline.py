@@ -104,12 +104,7 @@ class Pipeline(ABC):
 
     @abstractmethod
     def correct(self, correction: PoseCorrection, more: bool = False) -> CorrectionReport:
-        """Apply poses and points that the tracker has revised.
-
-        Args:
-            correction: The revised poses and points.
-            more: Whether another correction follows at once, with which the Gaussians then move.
-        """
+        """Apply revised poses and points. With `more`, the Gaussians wait for another correction, and move with it."""
 
     @abstractmethod
     def finish(self, progress: Callable[[int, int, float], None] | None = None) -> object:
@@ -167,15 +162,7 @@ class Stopwatch:
 
 
 def breakdown_percent(seconds: Mapping[str, float], total: float) -> dict[str, float]:
-    """Compute the percentage of each stage, as in the paper's breakdown of time.
-
-    Args:
-        seconds: Time of each stage [s].
-        total: Total time of the mapping [s].
-
-    Returns:
-        Percentages of the paper's stages, and of the rest as `others`.
-    """
+    """Return the stages' percentages of a total time [s], as in the paper's breakdown, and the rest as `others`."""
     percent = {stage: 100.0 * seconds.get(stage, 0.0) / total for stage in BREAKDOWN}
     percent["others"] = 100.0 - sum(percent.values())
     return {stage: round(value, 2) for stage, value in percent.items()}

@@ -145,12 +145,7 @@ def in_steps(steps: int) -> Schedule:
 
 
 def in_seconds(seconds: float, clock: Callable[[], float] = time.perf_counter) -> Schedule:
-    """Return the schedule of a refinement that takes so much time, from its first step on.
-
-    Args:
-        seconds: The time [s].
-        clock: Returns the time on any clock [s].
-    """
+    """Return the schedule of a refinement that takes so long, by a clock, from its first step on [s]."""
     began: list[float] = []
 
     def share(_: int) -> float | None:

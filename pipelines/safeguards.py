@@ -114,14 +114,9 @@ class MemoryBudget:
         return self.limit is not None or count > self.gaussians.capacity - len(self.gaussians)
 
     def take_gaussians(self, position: NDArray[np.float64], size: float) -> int:
-        """Determine how many new Gaussians fit, together with the voxels that they may mark.
+        """Return how many of the first positions (N, 3) fit as Gaussians, with the voxels of a size that they may mark.
 
-        Args:
-            position: Positions (N, 3) in order of preference.
-            size: Target voxel size [scene units].
-
-        Returns:
-            Number of leading positions that fit. The others are counted as rejected.
+        The others are counted as rejected.
         """
         taken = min(len(position), self.gaussians.capacity - len(self.gaussians))
         if self.limit is not None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from fields.frames.tracked_frame import TrackedFrame
 from fields.map.keyframe import Keyframe
-from fields.map.keyframe_state import KeyframeRows, keyframe_arrays
+from fields.map.keyframes import KeyframeRows, keyframe_arrays
 from pipelines.densify.densifier import Anchor
 from pipelines.online import OnlineMapper
 

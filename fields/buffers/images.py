@@ -141,14 +141,9 @@ class ImageBuffers:
         builder.place(self.background)
 
     def resize(self, width: int, height: int) -> None:
-        """Set the image size, and clear the planar buffers if it changes.
+        """Set the image size [px], and clear the planar buffers if it changes.
 
-        Args:
-            width: Image width [px].
-            height: Image height [px].
-
-        Raises:
-            ValueError: If the size exceeds the capacity.
+        Raises ValueError if the size exceeds the capacity.
         """
         if (width, height) == (self.width, self.height):
             return
@@ -184,11 +179,7 @@ class ImageBuffers:
     # ---- to and from NumPy -----------------------------------------------------------------------------------
 
     def set_reference(self, image: np.ndarray) -> None:
-        """Set the reference image.
-
-        Args:
-            image: RGB and validity (H, W, 4) uint8. The last channel is 255 at valid pixels and 0 at masked ones.
-        """
+        """Set the reference image: RGB and validity (H, W, 4) uint8, 255 at valid pixels and 0 at masked ones."""
         self.masked = self._references is None and not image[..., 3].all()
         pixels = np.ascontiguousarray(image) if self._references is None else self._references.of(image)
         self._take_reference(self.width * self.height, self.width, self.height, pixels)

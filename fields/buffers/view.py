@@ -43,7 +43,7 @@ class ViewField:
         self.height = 0
 
     def set(self, camera: PinholeCamera, T_camera_world: ArrayLike, near: float) -> None:
-        """Set the view."""
+        """Set the view: a pose (4, 4), and the depth below which nothing is drawn [scene units]."""
         T = np.asarray(T_camera_world, dtype=np.float64)
         fx, fy, cx, cy, width, height = camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height
         margin_x, margin_y = FRUSTUM_MARGIN * 0.5 * width / fx, FRUSTUM_MARGIN * 0.5 * height / fy

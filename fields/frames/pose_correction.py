@@ -52,13 +52,9 @@ class CameraRevision:
         return before + (after - inside)
 
     def points(self, points_camera: NDArray[np.floating], before: PinholeCamera) -> NDArray[np.float64]:
-        """Move points (N, 3) in the camera frame onto the new rays of their pixels. Their depths stay.
+        """Move points (N, 3) in the frame of the former camera onto the new rays of their pixels. Their depths stay.
 
         Points that are not in front of the camera stay.
-
-        Args:
-            points_camera: The points.
-            before: The former camera.
         """
         moved = np.array(points_camera, dtype=np.float64)
         front = moved[:, 2] > 0

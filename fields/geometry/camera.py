@@ -94,15 +94,7 @@ NEAR_AND_FAR = (0.6, 1.6)
 
 
 def pixel_jacobian(camera: PinholeCamera, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Jacobian of pixel positions with respect to a pose increment exp(xi) at xi = 0.
-
-    Args:
-        camera: Intrinsics.
-        points: Points (N, 3) in the camera frame, with z > 0.
-
-    Returns:
-        d pixel / d xi (N, 2, 6).
-    """
+    """Return d pixel / d xi (N, 2, 6) of points (N, 3) before the camera, for a pose increment exp(xi) at xi = 0."""
     x, y, z = points.T
     fx, fy, zero = camera.fx / z, camera.fy / z, np.zeros(len(points))
     by_point = np.stack([fx, zero, -fx * x / z, zero, fy, -fy * y / z], axis=1).reshape(-1, 2, 3)

@@ -135,11 +135,7 @@ def _groups(numbers: Sequence[NDArray[np.int32]]) -> tuple[NDArray[np.int64], ND
 
 
 def extent_of(log_scale: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Return radii (N,) of spheres that hold what is drawn of Gaussians, three of their largest standard deviations.
-
-    Args:
-        log_scale: Logarithms of the standard deviations (N, 3).
-    """
+    """Return radii (N,) of spheres that hold three standard deviations of Gaussians, given log_scale (N, 3)."""
     return 3.0 * np.exp(log_scale.max(axis=1))
 
 
@@ -163,16 +159,9 @@ def _around(
 
 
 def seen(planes: NDArray[np.float64], boxes: Boxes) -> NDArray[np.bool_]:
-    """Return which views see which boxes, at least in part. Occlusion does not count.
+    """Return which views, given by their planes (V, 6, 4), see which of B boxes (V, B), at least in part.
 
-    A box beside the image that two planes cut may count as seen without being so.
-
-    Args:
-        planes: The planes (V, 6, 4) of the views, see `planes_of`.
-        boxes: The boxes, B of them.
-
-    Returns:
-        Flags (V, B).
+    Occlusion does not count. A box beside the image that two planes cut may count as seen without being so.
     """
     visible = np.ones((len(planes), len(boxes)), dtype=bool)
     centre, half = 0.5 * (boxes.low + boxes.high), 0.5 * (boxes.high - boxes.low)

@@ -150,15 +150,9 @@ class GaussianField:
             self.count += n
 
     def remove(self, keep: NDArray[np.bool_]) -> int:
-        """Remove the Gaussians where `keep` is false.
+        """Remove the Gaussians where `keep` (count,) is false, and return their number.
 
         Kept Gaussians from the end fill the holes in order, which is parallel and deterministic.
-
-        Args:
-            keep: Flags (count,).
-
-        Returns:
-            Number of Gaussians removed.
         """
         if keep.shape != (self.count,):
             raise ValueError(f"keep has shape {keep.shape}, expected ({self.count},)")
@@ -205,10 +199,7 @@ class GaussianField:
         return out
 
     def load(self, state: dict[str, NDArray]) -> None:
-        """Replace all Gaussians by those of `state`.
-
-        Args:
-            state: Values in the form of `to_numpy`, and optionally their anchors (N,) as `anchor`.
+        """Replace all Gaussians by values in the form of `to_numpy`, optionally with their anchors (N,) as `anchor`.
 
         Raises:
             ValueError: As in `append`. The Gaussians are then unchanged.
@@ -243,10 +234,7 @@ class GaussianField:
         self.extend(state)
 
     def extend(self, state: dict[str, NDArray]) -> None:
-        """Add saved Gaussians with their optimiser state.
-
-        Args:
-            state: The entries of `to_numpy` and `history`, and optionally the coverages (N,) as `coverage`.
+        """Add saved Gaussians: the entries of `to_numpy` and `history`, and optionally the `coverage` (N,).
 
         Raises:
             KeyError: If an entry is missing.

@@ -137,10 +137,6 @@ class Keyframe:
 
         The points keep their depths at the tracked pose. Those whose pixels leave the image are dropped, and so is the
         mask of what moves.
-
-        Args:
-            revision: The new camera.
-            vignette: The vignette of its images.
         """
         self.mask(None)
         T, points, rgba = self.T_tracked, self.points, revision.image(self.rgba)

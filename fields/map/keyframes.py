@@ -1,9 +1,9 @@
-"""Keyframes, and frames between them: the views that the map is optimised on."""
+"""Keyframes, and frames between them: the views that the map is optimised on, and their state as plain arrays."""
 
 from __future__ import annotations
 
 from bisect import bisect_left, insort
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -126,12 +126,7 @@ class KeyframeStore:
         return (first, *(o for o in others if min(o.camera.width, o.camera.height) >= self.min_side))
 
     def append(self, frame: TrackedFrame, is_between: bool = False) -> Keyframe:
-        """Add a frame as a keyframe. Its error starts at the mean of the others (1 for the first keyframe).
-
-        Args:
-            frame: The frame.
-            is_between: Whether it is a frame between keyframes.
-        """
+        """Add a frame as a keyframe, or as one between. Its error starts at the mean of the others, the first at 1."""
         self.trajectory.add(frame)
         self.views = frame.views
         keyframe = self.view(frame, self.levels)
@@ -161,14 +156,10 @@ class KeyframeStore:
         self.nbytes += keyframe.nbytes
 
     def move_to_disk(self, keyframes: Sequence[Keyframe], stored: Callable[[list[NDArray]], list[NDArray]]) -> None:
-        """Replace the images of keyframes of the store, and their points, by memory-mapped ones.
+        """Replace the images of keyframes of the store, and their points, by the arrays that `stored` returns for them.
 
         Images that lie on disk already stay there. Points count in `nbytes` all the same, since a correction brings
         them back.
-
-        Args:
-            keyframes: The keyframes.
-            stored: Returns such arrays for arrays, in order.
         """
         going = [keyframe for keyframe in keyframes if keyframe.image_bytes > 0]
         if not going:
@@ -202,13 +193,9 @@ class KeyframeStore:
             self._depths.add(keyframe.median_depth)
 
     def view(self, frame: TrackedFrame, levels: int = 1) -> Keyframe:
-        """Return a frame as a keyframe, without adding it to the store.
+        """Return a frame as a keyframe with so many pyramid levels, without adding it to the store.
 
         Pose and exposure are interpolated between the surrounding keyframes, see `corrected` and `exposure_at`.
-
-        Args:
-            frame: The frame.
-            levels: Number of pyramid levels.
         """
         return Keyframe(
             index=frame.index,
@@ -225,17 +212,10 @@ class KeyframeStore:
         )
 
     def corrected(self, index: int, T_tracked: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Apply the refinement of the surrounding keyframes to a tracked pose (Section 3.3.3).
+        """Apply the refinement of the surrounding keyframes to a tracked pose T_camera_world (4, 4) (Section 3.3.3).
 
         The correction is interpolated by frame index between the keyframes of the same view before and after the frame.
         Outside the range of the keyframes, that of the nearest one is used. A view without keyframes stays as tracked.
-
-        Args:
-            index: Index of the frame.
-            T_tracked: Tracked pose T_camera_world (4, 4).
-
-        Returns:
-            Corrected pose T_camera_world (4, 4).
         """
         if not self._keyframes:
             return np.array(T_tracked, dtype=np.float64)
@@ -280,3 +260,79 @@ class KeyframeStore:
 def centres_of(keyframes: Sequence[Keyframe]) -> NDArray[np.float64]:
     """Return the camera centres (K, 3) of keyframes in the world frame."""
     return camera_centres(np.array([keyframe.T_camera_world for keyframe in keyframes]))
+
+
+# Scalars and small matrices of a `Keyframe`, with their shapes.
+NUMBERS: dict[str, tuple[int, ...]] = {
+    "index": (),
+    "T_camera_world": (4, 4),
+    "median_depth": (),
+    "error": (),
+}
+POINTS = {"xyz": 3, "pixels": 2}
+NO_MASK = np.zeros((0, 0), dtype=np.uint8)
+
+
+def keyframe_arrays(store: Iterable[Keyframe]) -> dict[str, NDArray]:
+    """Store keyframes as arrays, without their images, which are taken from the frames again.
+
+    Args:
+        store: The keyframes.
+
+    Returns:
+        One array per field of `NUMBERS`, `exposure` and `is_between`, with one row per keyframe. The rows of `exposure`
+        are NaN for keyframes without one. `points` holds the number of tracked points of each keyframe; `xyz` (P, 3),
+        `pixels` (P, 2) and `ids` (P,) hold the points of all keyframes, concatenated. If anything moves, `transient`
+        holds the masks of all keyframes, concatenated, and `transient_size` (N, 2) their sizes, 0 without a mask.
+    """
+    views = list(store)
+    arrays: dict[str, NDArray] = {
+        name: np.array(
+            [getattr(view, name) for view in views], dtype=np.int64 if name == "index" else np.float64
+        ).reshape(-1, *shape)
+        for name, shape in NUMBERS.items()
+    }
+    unknown = np.full((3, 4), np.nan)
+    exposures = [unknown if view.exposure is None else view.exposure for view in views]
+    arrays["exposure"] = np.array(exposures).reshape(-1, 3, 4)
+    arrays["is_between"] = np.array([view.is_between for view in views], dtype=np.int64)
+    arrays["points"] = np.array([len(view.points) for view in views], dtype=np.int64)
+    for name, width in POINTS.items():
+        parts = [getattr(view.points, name) for view in views]
+        arrays[name] = np.concatenate([*parts, np.zeros((0, width))])
+    arrays["ids"] = np.concatenate([*(view.points.ids for view in views), np.zeros(0, dtype=np.int64)])
+    masks = [NO_MASK if view.transient is None else view.transient for view in views]
+    if any(mask.size for mask in masks):
+        arrays["transient"] = np.concatenate([mask.ravel() for mask in masks])
+        arrays["transient_size"] = np.array([mask.shape for mask in masks], dtype=np.int64)
+    return arrays
+
+
+class KeyframeRows:
+    """Restores the keyframes of `keyframe_arrays` into a store, frame by frame.
+
+    Attributes:
+        rows: Row of each keyframe, by frame index.
+    """
+
+    def __init__(self, arrays: Mapping[str, NDArray]) -> None:
+        self.rows = {int(index): row for row, index in enumerate(arrays["index"])}
+        self._arrays = arrays
+        self._first = np.append(0, np.cumsum(arrays["points"]))
+        self._mask_size = arrays.get("transient_size", np.zeros((len(self.rows), 2), dtype=np.int64))
+        self._masks = np.split(arrays.get("transient", NO_MASK.ravel()), np.cumsum(self._mask_size.prod(axis=1))[:-1])
+
+    def put(self, frame: TrackedFrame, store: KeyframeStore) -> None:
+        """Append the next keyframe, from its frame. Raises ValueError if the frame is not that of the next row."""
+        row = len(store)
+        if self.rows.get(frame.index) != row:
+            raise ValueError(f"frame {frame.index} is not keyframe {row}")
+        view = store.append(frame, bool(self._arrays["is_between"][row]))
+        view.T_camera_world = np.array(self._arrays["T_camera_world"][row])
+        view.median_depth, view.error = (float(self._arrays[name][row]) for name in ("median_depth", "error"))
+        exposure = self._arrays["exposure"][row]
+        view.exposure = None if np.isnan(exposure).all() else np.array(exposure)
+        own = slice(self._first[row], self._first[row + 1])
+        view.points = SparsePoints(*(np.array(self._arrays[name][own]) for name in ("xyz", "pixels", "ids")))
+        if self._masks[row].size:
+            store.mask(view, self._masks[row].reshape(self._mask_size[row]))

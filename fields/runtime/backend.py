@@ -142,11 +142,7 @@ def _start(arch: object, options: dict) -> None:
 
 
 def describe(backend: str) -> str:
-    """Describe a backend for the log of a run: the device's name, or why an existing GPU is not used.
-
-    Args:
-        backend: Result of `initialise`.
-    """
+    """Describe a result of `initialise` for the log of a run: the device, or why an existing GPU is not used."""
     if backend == "cuda":
         return f"CUDA ({torch.cuda.get_device_name()})"
     chosen = _vulkan_device() if backend == "vulkan" else None
@@ -203,16 +199,10 @@ def torch_device() -> torch.device:
 
 
 def without_waiting(array: np.ndarray) -> np.ndarray | torch.Tensor:
-    """Prepare a small array as a read-only kernel argument, so that the launch does not wait for the device.
+    """Return a small array as a read-only kernel argument, on CUDA as a tensor, whose launch waits for nothing.
 
     On CUDA, the engine copies NumPy arrays to the device and back and waits for both. The driver takes a copy of a
     small array at once, so that the array may change after this call; pinned memory would have to be kept until then.
-
-    Args:
-        array: The array.
-
-    Returns:
-        A tensor on a CUDA device; otherwise the array itself.
     """
     if configuration().arch != ti.cuda:
         return array
@@ -255,14 +245,7 @@ def place(fields: Sequence[ti.Field], blocks: ti.SNode, *shape: int) -> None:
 
 
 def refuse_too_many_fields(last_placed: ti.ScalarField | ti.MatrixField) -> None:
-    """Check that the fields placed so far fit into the engine's runtime.
-
-    Args:
-        last_placed: The scalar field that was placed last.
-
-    Raises:
-        RuntimeError: If there are more SNodes than the engine supports in a process.
-    """
+    """Raise RuntimeError if the SNodes so far, up to the scalar field placed last, are too many for the engine."""
     if MAX_SNODES is not None and last_placed.snode.ptr.id >= MAX_SNODES:
         raise too_many()
 

@@ -314,12 +314,7 @@ _arrays: weakref.WeakSet[Any] = weakref.WeakSet()
 
 
 def dense_array(dtype: Any, shape: tuple[int, ...]) -> Any:
-    """Return an array of zeros on the device, which kernels take as an argument. It is freed with its last reference.
-
-    Args:
-        dtype: Type of the engine, for example `ti.i32`.
-        shape: Shape of the array.
-    """
+    """Return an array of zeros on the device, which kernels take as arguments. Its last reference frees it."""
     array = ti.ndarray(dtype, shape)
     _arrays.add(array)
     return array

@@ -89,14 +89,9 @@ def _describe(vulkan: ctypes.CDLL, index: int, handle: int) -> VulkanDevice:
 
 
 def choose(devices: Sequence[VulkanDevice], asked: str | None = None) -> VulkanDevice | None:
-    """Choose a device: a discrete GPU before an integrated one, and a software driver last.
+    """Return the device with the asked index, else a discrete GPU before an integrated one, a software driver last.
 
-    Args:
-        devices: The devices of the machine.
-        asked: Index of the device to choose instead; without effect if there is no such device.
-
-    Returns:
-        The device; None if there is none.
+    Returns None if there is no device.
     """
     for device in devices:
         if str(device.index) == asked:

@@ -120,11 +120,7 @@ def pin_workers(before: set[int], workers: int) -> None:
 
     The workers sleep between kernels, and Linux often wakes two of them on the same processor. A kernel of 1 ms then
     takes as long on two threads as on one, and a step takes a quarter longer. With fewer workers than processors, the
-    scheduler has free processors to choose from.
-
-    Args:
-        before: Ids of the threads that existed before Taichi started.
-        workers: Number of Taichi's worker threads.
+    scheduler has free processors to choose from. `before` are the ids of the threads before Taichi started.
     """
     if not hasattr(os, "sched_setaffinity"):
         return

@@ -162,13 +162,7 @@ def _is_empty() -> bool:
 
 
 def ensure_started(device: str) -> str:
-    """Start the engine, unless others use it: then they share it.
-
-    Args:
-        device: A device as for `initialise`.
-
-    Returns:
-        The backend in use.
+    """Start the engine on a device as `initialise` does, unless others use it, and return the backend in use.
 
     Raises:
         RuntimeError: If a GPU was requested and does not start, or the engine is in use on another device.

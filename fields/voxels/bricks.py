@@ -81,9 +81,7 @@ def places_of_marks(
 ) -> tuple[NDArray[np.int32], NDArray[np.uint64]]:
     """Return the places (M, 4) of the non-zero words of bricks, in lexicographic order, and these words (M,).
 
-    Args:
-        corners: The bricks' corners (B, 3), each once.
-        words: Their words (B, 10).
+    The bricks are given by their corners (B, 3), each once, and their words (B, 10).
     """
     order = np.argsort(numbered(corners))
     corners, words = corners[order], words[order]

@@ -141,14 +141,9 @@ class OccupancyVoxels(Tenant):
             self._resting = RestingBricks(self._bricks)
 
     def settle(self, coarsest: float, origin: ArrayLike) -> None:
-        """Set the size of the coarsest cell and the centre of the covered volume. No cell may be marked yet.
+        """Set the size of the coarsest cell and the centre (3,) of the covered volume. No cell may be marked yet.
 
-        Args:
-            coarsest: Size of the coarsest cell [scene units].
-            origin: Centre (3,) in the world frame.
-
-        Raises:
-            ValueError: If `coarsest` is not positive.
+        Raises ValueError if `coarsest` is not positive.
         """
         if not coarsest > 0:
             raise ValueError(f"voxels need a positive cell, got {coarsest=}")
@@ -161,11 +156,7 @@ class OccupancyVoxels(Tenant):
         self._resting.clear()
 
     def rest(self, used: ArrayLike) -> None:
-        """Pack the marks of places where none of some positions lie. The answers stay the same.
-
-        Args:
-            used: Positions (N, 3) in the world frame.
-        """
+        """Pack the marks of places where none of the positions (N, 3) lie. The answers stay the same."""
         self._resting.rest(self._finest(used))
 
     @property
@@ -232,23 +223,14 @@ class OccupancyVoxels(Tenant):
         return self._bricks.query(*self._cells(position, size))
 
     def update(self, position: ArrayLike, size: ArrayLike) -> None:
-        """Mark each position as occupied, from the coarsest level down to that of its target size.
-
-        Args:
-            position: Positions (N, 3) in the world frame.
-            size: Target sizes (N,) or () [scene units].
-        """
+        """Mark positions as occupied, from the coarsest level down to that of their target sizes, see `query`."""
         self.admit(position, size)
 
     def bytes_to_mark(self, position: ArrayLike, size: ArrayLike) -> NDArray[np.int64]:
-        """Return an upper bound (N,) on the growth of `nbytes` when the positions are marked in order.
+        """Return an upper bound (N,) on the growth of `nbytes` when positions are marked in order, as in `update`.
 
         A brick counts as new if the coarsest cell of the position in it is unmarked, even if another of its cells is
         marked.
-
-        Args:
-            position: Positions (N, 3) in the world frame.
-            size: Target sizes (N,) or () [scene units].
         """
         cells, level = self._cells(position, size)
         cost = np.zeros(len(cells), dtype=np.int64)

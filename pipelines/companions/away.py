@@ -118,11 +118,7 @@ class BlocksOnDisk:
             raise
 
     def add(self, blocks: Sequence[tuple[NDArray[np.void], Boxes, NDArray[np.int64]]]) -> None:
-        """Write blocks. Raises OSError if there is no room; none of them is then here.
-
-        Args:
-            blocks: The records, the box and the places of the viewers of each block.
-        """
+        """Write blocks, given by records, box and places of viewers. Raises OSError, and adds none, without room."""
         if not blocks:
             return
         stored = self._files.write([records for records, _, _ in blocks])
@@ -171,11 +167,7 @@ class BlocksOnDisk:
                 self.forget(block)
 
     def change(self, block: BlockOnDisk, change: Callable[[int], None]) -> None:
-        """Change the Gaussians of a block.
-
-        Args:
-            block: The block.
-            change: Changes the resident Gaussians from a place on, which are then those of the block.
+        """Change the Gaussians of a block: `change` changes the resident ones from a place on, which are then those.
 
         Raises:
             BlockError: As in `read`.
@@ -191,23 +183,13 @@ class BlocksOnDisk:
         self.gaussians.remove(np.arange(len(self.gaussians)) < first)
 
     def resident_records(self, first: int = 0, members: NDArray[np.int64] | slice = ALL) -> NDArray[np.void]:
-        """Return the complete state of resident Gaussians as records.
-
-        Args:
-            first: Place from which on they are considered.
-            members: Places of those that are returned, counted from there.
-        """
+        """Return the complete state of resident Gaussians, of `members` counted from place `first` on, as records."""
         state = self.gaussians.to_numpy(first) | self.gaussians.history(first)
         state["coverage"] = self.gaussians.coverages(first)
         return records_of({name: array[members] for name, array in state.items()})
 
     def remove_hidden(self, min_coverage: float, spared: NDArray[np.bool_]) -> None:
-        """Remove Gaussians whose coverage was too small in the present sweep.
-
-        Args:
-            min_coverage: Smallest coverage of what stays [px].
-            spared: Whether the Gaussians of each anchor (A,) stay.
-        """
+        """Remove Gaussians with less than this coverage in the present sweep [px], except of spared anchors (A,)."""
         measured = [block for block in self if block.sweep == self.sweep]
         for first in range(0, len(measured), CHUNK):
             smaller, gone = [], []
@@ -236,11 +218,7 @@ class BlocksOnDisk:
         return found
 
     def look(self, place: int) -> None:
-        """Determine which blocks a new keyframe sees.
-
-        Args:
-            place: Its place in the store.
-        """
+        """Determine which blocks a new keyframe, at this place in the store, sees."""
         keyframe = self.keyframes[place]
         if self._blocks:
             for block in self.at(np.flatnonzero(seen(planes_of_views([keyframe]), self.boxes)[0])):

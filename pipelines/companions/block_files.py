@@ -43,11 +43,7 @@ class StoredBlock:
 
 
 def records_of(state: dict[str, NDArray]) -> NDArray[np.void]:
-    """Return Gaussians as an array (N,) of records, with a field for each entry of their state, in order.
-
-    Args:
-        state: The entries of `GaussianField.to_numpy` and `history`.
-    """
+    """Return records (N,) with a field for each entry of `GaussianField.to_numpy` and `history`, in order."""
     fields = [(name, array.dtype, array.shape[1:]) for name, array in state.items()]
     records = np.zeros(len(state["opacity_logit"]), dtype=fields)
     for name, array in state.items():
@@ -154,13 +150,9 @@ class BlockFiles:
         return stored
 
     def joined(self, count: int, parts: Iterable[Mapping[str, NDArray]]) -> dict[str, NDArray]:
-        """Join arrays that come in parts in a file, and return them memory-mapped. Raises OSError as `write` does.
+        """Join arrays of `count` rows that come in parts in a file, and return them memory-mapped.
 
-        The file goes with the arrays; on Windows, with the folder.
-
-        Args:
-            count: Length of the joined arrays.
-            parts: Arrays by name, at least one of them.
+        The file goes with the arrays; on Windows, with the folder. Raises OSError as `write` does.
         """
         following = iter(parts)
         first = next(following)

@@ -113,7 +113,7 @@ class ChangeSweep(Companion):
 
 
 class Changes:
-    """What views of a later visit tell about surfaces, of the map as it is now and as it was then."""
+    """What views of a later visit tell about surfaces, compared with the present map and with that of then."""
 
     def __init__(self, now: Sequence[CoarseView], then: Sequence[CoarseView]) -> None:
         # A surface of the earlier map that is hidden by a new one may still be there.
@@ -131,12 +131,7 @@ class Changes:
         return np.concatenate(found)
 
     def seen_by(self, now: CoarseView, then: CoarseView) -> NDArray[np.bool_]:
-        """Return where (h, w) a view of the earlier visit shows what has changed.
-
-        Args:
-            now: The view compared with the present map.
-            then: The same view compared with the map of the earlier visit.
-        """
+        """Return where (h, w) a view of the earlier visit, compared with the maps of both visits, shows a change."""
         found = np.zeros(then.depth.shape, dtype=bool)
         for view, voters in ((then, self._gone), (replace(then, depth=now.depth), self._new)):
             cells = then.valid & (view.depth > 0) & (then.difference < then.wrong)

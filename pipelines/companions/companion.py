@@ -21,12 +21,7 @@ class Companion:
     """
 
     def before_frame(self, frame: TrackedFrame, is_wanted: bool) -> None:
-        """Called with each frame that reaches the map before it is added to it.
-
-        Args:
-            frame: The frame.
-            is_wanted: Whether it should become a keyframe, if the memory budget has room for it.
-        """
+        """Called with each frame before it is added to the map, as a keyframe if that is wanted and has room."""
 
     def after_view(self, place: int) -> None:
         """Called when a frame has become a view of the map, at this place in the store."""
@@ -34,10 +29,7 @@ class Companion:
     def new_keyframe(self, store: KeyframeStore, renderer: Renderer, near: float) -> None:
         """Called with each new keyframe, the last of the store, after its pose is aligned and before it adds Gaussians.
 
-        Args:
-            store: The keyframes.
-            renderer: Renderer of the map. Its images may be overwritten.
-            near: Depth below which nothing is drawn [scene units].
+        The renderer's images may be overwritten.
         """
 
     def before_step(self) -> None:
@@ -50,17 +42,7 @@ class Companion:
         """Called with these views when all gradients are known, before the Gaussians are updated."""
 
     def after_keyframe(self, near: float, swept: int | None) -> None:
-        """Called after the steps of a new keyframe.
-
-        Args:
-            near: Depth below which nothing is drawn [scene units].
-            swept: Number of keyframes to sweep for hidden Gaussians, see `Plan.swept`.
-        """
+        """Called after the steps of a new keyframe. For `swept`, see `Plan`."""
 
     def before_passes(self, places: NDArray[np.int64], near: float) -> None:
-        """Called before the passes over keyframes that finish or refine a map.
-
-        Args:
-            places: Places (N,) of the keyframes in the store.
-            near: Depth below which nothing is drawn [scene units].
-        """
+        """Called before the passes over the keyframes at these places (N,) that finish or refine a map."""

@@ -38,14 +38,11 @@ def resized_vignette(vignette: NDArray[np.float32], rgba: NDArray[np.uint8]) -> 
 
 
 def light_changes(store: KeyframeStore) -> bool:
-    """Whether the tracked points of earlier keyframes are brighter or darker in the latest one.
+    """Whether the tracked points of earlier keyframes are brighter or darker in the latest one, of the latest place.
 
     The points are projected into the latest keyframe, without a test of visibility: the median ratio of the colours
     treats occluded points, highlights and moving things as outliers. The map is not needed, so that a young one, whose
     colours are still wrong, does not look like a change.
-
-    Args:
-        store: The keyframes. Those before the latest place began do not count.
     """
     latest = store[-1]
     here = _colours(latest, store.levels)
@@ -98,15 +95,7 @@ LARGEST_GAIN = 4.0
 
 
 def scene_colours(view: Keyframe, pixels: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Colours of the scene at pixels of a view: its image with vignette and exposure removed.
-
-    Args:
-        view: The view.
-        pixels: Integer pixels (N, 2) as (column, row).
-
-    Returns:
-        Colours (N, 3), clipped to [0, 2] if the view has a vignette or an exposure.
-    """
+    """Colours (N, 3) of the scene at integer pixels (N, 2) of a view: without vignette and exposure, within [0, 2]."""
     column, row = pixels.T
     colours = view.rgba[row, column, :3] / 255.0
     if view.vignette is not None:

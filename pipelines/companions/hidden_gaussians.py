@@ -116,11 +116,7 @@ class HiddenGaussians(Companion):
             self.sweep(swept, near)
 
     def sweep_when_due(self, near: float) -> None:
-        """Sweep over all keyframes that are near, if half as many have come since the last such sweep.
-
-        Args:
-            near: Depth below which nothing is drawn [scene units].
-        """
+        """Sweep over all keyframes that are near, if half as many have come since the last such sweep."""
         selected = self._densifier.keyframes.selected
         while self.due < len(selected):  # they came with a finished map
             self.due += -(-self.due // 2)
@@ -133,12 +129,7 @@ class HiddenGaussians(Companion):
         self._remove(self._min_contribution, self._densifier.first_anchor_since(selected[-YOUNG:][0]))
 
     def sweep(self, count: int, near: float) -> None:
-        """Measure the next keyframes. After the last one, Gaussians are removed, and the next sweep begins.
-
-        Args:
-            count: Number of keyframes.
-            near: Depth below which nothing is drawn [scene units].
-        """
+        """Measure the next `count` keyframes. After the last one, Gaussians are removed, and the next sweep begins."""
         store = self._densifier.keyframes
         if count == 0 or not store.selected or self._min_contribution == 0.0:
             return
@@ -152,12 +143,7 @@ class HiddenGaussians(Companion):
             self._remove(self._min_contribution, self._densifier.first_anchor_since(self._young))
 
     def remove(self, min_contribution: float, near: float) -> None:
-        """Remove all Gaussians of a finished map that hardly show in any view. A sweep that goes on is given up.
-
-        Args:
-            min_contribution: Coverage in the view that shows most of a Gaussian, below which it is removed [px].
-            near: Depth below which nothing is drawn [scene units].
-        """
+        """Remove all Gaussians that cover less than this in every view of a finished map [px], and give up a sweep."""
         self._swept = 0
         self._begin()
         self._measure(self._densifier.keyframes, near, 0)

@@ -49,9 +49,6 @@ class OtherPlaces(Companion):
 
         A Gaussian is far if the view that placed it is. Sizes are limited as soon as a second place begins, not when a
         view of that place first shows a Gaussian, so that what the camera has left stays as it was.
-
-        Args:
-            views: The views of an Adam step, whose gradients have been accumulated.
         """
         store = self._densifier.keyframes
         if self.gaussians.count and store.begins:

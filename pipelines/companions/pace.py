@@ -41,30 +41,15 @@ class Pace(Protocol):
         ...
 
     def plan(self, level: int, keyframes: int, frames: int) -> Plan:
-        """Return the work of a new keyframe.
-
-        Args:
-            level: Pyramid level on which it is optimised.
-            keyframes: Number of keyframes so far, with this one.
-            frames: Number of frames so far, with this one.
-        """
+        """Return the work of a new keyframe, optimised on a pyramid level, the last of so many keyframes and frames."""
         ...
 
     def steps_after_correction(self, keyframes: int, frames: int) -> int:
-        """Return the number of optimisation steps after a correction that moved Gaussians.
-
-        Args:
-            keyframes: Number of keyframes so far.
-            frames: Number of frames so far.
-        """
+        """Return the number of optimisation steps after a correction that moved Gaussians."""
         ...
 
     def last_views(self, keyframes: int) -> int:
-        """Return the number of views of the last passes over the finished map.
-
-        Args:
-            keyframes: Number of keyframes, with the frames between them that are views.
-        """
+        """Return the number of views of the last passes over a finished map of so many views."""
         ...
 
 
@@ -214,12 +199,7 @@ class RealtimePace:
     # ---- what the pace is told -------------------------------------------------------------------------------
 
     def begin_frame(self, arrived: float, now: float) -> None:
-        """Called before each frame.
-
-        Args:
-            arrived: When the frame arrived [s].
-            now: The time on the same clock [s].
-        """
+        """Called before each frame with the time at which it arrived, and the present time on the same clock [s]."""
         self._arrived = arrived
         self._planned = None
         self.lag = max(0.0, now - arrived)

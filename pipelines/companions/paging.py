@@ -119,8 +119,7 @@ class Paging(Companion):
     def before_frame(self, frame: TrackedFrame, is_wanted: bool) -> None:
         """Make room for what a frame adds, and bring in what it sees if it should become a keyframe.
 
-        Raises:
-            BlockError: If a block's file is missing or damaged. The map is then without it.
+        Raises BlockError as `to_numpy`.
         """
         area = frame.camera.width * frame.camera.height / (640 * 480)
         self._prepare(frame, round(self.settings.densify.pixels * area**0.75) if is_wanted else 0, bring=is_wanted)
@@ -160,13 +159,9 @@ class Paging(Companion):
             self.most_missing = round(MISSING * np.count_nonzero(in_sight))
 
     def rewrite(self, change: Callable[[int], None]) -> None:
-        """Change the Gaussians of all blocks on disk.
+        """Change the Gaussians of all blocks on disk, one block after the other.
 
-        Args:
-            change: Changes the resident Gaussians from a place on. It is called for one block after the other.
-
-        Raises:
-            BlockError: If a block's file is missing or damaged. The map is then without it.
+        `change` changes the resident Gaussians from a place on. Raises BlockError as `to_numpy`.
         """
         for block in self.away:
             self._make_room([], block.stored.count, 0)
@@ -196,11 +191,7 @@ class Paging(Companion):
         return [np.flatnonzero(self.group == number) for number in range(self.group.max(initial=-1) + 1)]
 
     def before_views(self, views: Sequence[Keyframe]) -> None:
-        """Bring in what keyframes see, before they are rendered.
-
-        Raises:
-            BlockError: If a block's file is missing or damaged. The map is then without it.
-        """
+        """Bring in what keyframes see, before they are rendered. Raises BlockError as `to_numpy`."""
         if any(self.away.missing[view.index] for view in views):
             self._bring(views, 0, 0)
 

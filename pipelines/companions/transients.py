@@ -129,12 +129,7 @@ class Ballot:
 
 
 def votes(xyz: NDArray[np.float64], views: Sequence[CoarseView]) -> Ballot:
-    """Ask views whether surface points are rendered rightly in them.
-
-    Args:
-        xyz: Points (N, 3) in the world frame.
-        views: The views.
-    """
+    """Ask views whether surface points (N, 3) are rendered rightly in them."""
     looks, right, wrong = np.zeros((3, len(xyz)), dtype=np.int64)
     for view in views:
         there = xyz @ view.T_camera_world[:3, :3].T + view.T_camera_world[:3, 3]

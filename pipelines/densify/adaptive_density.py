@@ -42,14 +42,7 @@ class GradientStatistics:
         self.views = ti.field(ti.i32, capacity)
 
     def observe(self, projected: ProjectedGaussians, view: ViewField) -> None:
-        """Add the gradients of one view.
-
-        Call it after compositing's backward pass and before projection's.
-
-        Args:
-            projected: Projected Gaussians of the view, with their gradients.
-            view: The view that was rendered.
-        """
+        """Add the gradients of the rendered view, after compositing's backward pass and before projection's."""
         if projected.count:
             self._observe(projected.seen, projected.gaussian, projected.mean.grad, 0.5 * view.width, 0.5 * view.height)
 
@@ -205,18 +198,7 @@ def union_of_points(views: Iterable[Keyframe]) -> PointCloud:
 
 
 def spacing(xyz: NDArray[np.float64], neighbours: int = NEIGHBOURS) -> NDArray[np.float64]:
-    """Mean distance of each point to its nearest neighbours.
-
-    Args:
-        xyz: Points (N, 3).
-        neighbours: Number of neighbours.
-
-    Returns:
-        Mean distances (N,).
-
-    Raises:
-        ValueError: If there are at most `neighbours` points.
-    """
+    """Mean distance (N,) of each point (N, 3) to its nearest neighbours. Raises ValueError if there are too few."""
     if len(xyz) <= neighbours:
         raise ValueError(f"{len(xyz)} points have no {neighbours} neighbours each")
     # FLANN works in float32. Centring keeps its precision independent of the world's origin.

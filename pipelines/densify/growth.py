@@ -58,14 +58,9 @@ def tracked_seeds(view: Keyframe) -> Seeds:
 
 
 def dissimilarity(render: NDArray[np.floating], rgba: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """1 - SSIM in grey between a render and an image, after a slight blur that suppresses noise.
+    """1 - SSIM in grey (H, W) between a render (H, W, 3) and an image (H, W, 4), after a slight blur against noise.
 
-    Args:
-        render: Rendered colour (H, W, 3).
-        rgba: Image (H, W, 4) with its mask in the last channel.
-
-    Returns:
-        Dissimilarity (H, W); 0 at masked pixels.
+    It is 0 at masked pixels.
     """
 
     def smooth(image: NDArray, side: int, sigma: float) -> NDArray[np.float32]:

@@ -60,11 +60,7 @@ class PoseRefinement:
     FARTHEST = 0.5
 
     def __init__(self, safeguards: Safeguards | None = None) -> None:
-        """Create the refinement.
-
-        Args:
-            safeguards: Counter of rejected steps; None for a new one.
-        """
+        """Create the refinement, with a counter of rejected steps."""
         self.safeguards = Safeguards() if safeguards is None else safeguards
         self.moments = Moments(6)
 

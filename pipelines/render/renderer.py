@@ -237,12 +237,7 @@ class Renderer:
         self.develop(None, None)
 
     def develop(self, exposure: np.ndarray | None, vignette: np.ndarray | None) -> None:
-        """Apply exposure and vignette to the rendered image.
-
-        Args:
-            exposure: Exposure (A, b) (3, 4); None for the identity.
-            vignette: Vignette (H, W, 3); None for no vignetting.
-        """
+        """Apply an exposure (A, b) (3, 4) and a vignette (H, W, 3) to the rendered image, each possibly None."""
         self.photometric.forward(exposure, vignette)
 
     def backward(

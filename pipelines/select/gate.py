@@ -22,17 +22,11 @@ if TYPE_CHECKING:  # `modp-ti check` measures sharpness without loading PyTorch
 
 
 def sharpness(rgb: NDArray[np.uint8]) -> float:
-    """Ratio of the detail of an image to the detail of its half-size version.
+    """Ratio of the detail of an image (H, W, 3 or more channels) to the detail of its half-size version.
 
     Detail is the mean absolute second difference along rows, columns and both diagonals. The smallest of the four
-    ratios is used, because motion blurs along one direction only.
-
-    Args:
-        rgb: Image (H, W, 3 or more channels).
-
-    Returns:
-        About 0.5 to 0.7 for a photograph, and a quarter less after a blur over two pixels. 0 for an image without any
-        detail or with a side shorter than 6 pixels.
+    ratios is used, because motion blurs along one direction only. It is about 0.5 to 0.7 for a photograph, a quarter
+    less after a blur over two pixels, and 0 without any detail or with a side shorter than 6 pixels.
     """
     if min(rgb.shape[:2]) < 6:
         return 0.0

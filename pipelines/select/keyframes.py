@@ -34,12 +34,7 @@ class KeyframeSelector:
         self.previous: int | None = None
 
     def is_keyframe(self, frame: TrackedFrame, last: Keyframe | None) -> bool:
-        """Whether `frame` becomes a keyframe. Call it once per frame, in order.
-
-        Args:
-            frame: The frame.
-            last: The latest keyframe of the same view; None if there is none.
-        """
+        """Whether a frame becomes a keyframe after the last one of its view. Call it once per frame, in order."""
         previous, self.previous = self.previous, frame.index
         if len(frame.points) < self.settings.min_points:
             return False

@@ -65,12 +65,7 @@ class FreeSpace:
         return ShownSurface(number, camera, T_camera_world, depth.astype(np.float32))
 
     def floating(self, numbers: NDArray[np.integer], views: Sequence[ShownSurface]) -> NDArray[np.bool_]:
-        """Return which of the loaded Gaussians (N,) float before the surfaces of other maps.
-
-        Args:
-            numbers: Number (N,) of the map that each Gaussian is from.
-            views: The surfaces of all maps.
-        """
+        """Return which of the loaded Gaussians (N,), of maps of these numbers, float before surfaces of other maps."""
         before, elsewhere = np.zeros(len(numbers)), np.zeros(len(numbers))
         for view in views:
             index, weight, weighted_ratio = self._shown(view)
@@ -112,13 +107,10 @@ Exposures = Mapping[int, NDArray[np.float64]]
 
 
 def colour_changes(maps: Sequence[Exposures]) -> list[NDArray[np.float64]]:
-    """Return the transforms (3, 4) of the colours of each map to those of the first one.
+    """Return the transforms (3, 4) of the colours of each map to those of the first one, given exposures by frame.
 
     Each map is compared with the one before it, in the frames that both have an exposure of; it takes over the
     transform of that one if there are none.
-
-    Args:
-        maps: Exposure (3, 4) of each frame of each map, by frame index.
     """
     changes = [np.array(IDENTITY)]
     for before, here in pairwise(maps):
@@ -169,13 +161,9 @@ class Shown:
 
 
 def owned(maps: Sequence[Shown], edge: float) -> list[NDArray[np.bool_]]:
-    """Return which Gaussians (N,) of each map lie in a cube of that map.
+    """Return which Gaussians (N,) of each map lie in a cube, of so long an edge, of that map.
 
     Gaussians that do not show are not kept. Of equal scores, that of the first map counts.
-
-    Args:
-        maps: The maps.
-        edge: Edge of a cube [scene units].
     """
     cubes = [_cubes(each.position, edge) for each in maps]
     keys, places = np.unique(_keys(np.concatenate(cubes)), return_inverse=True)

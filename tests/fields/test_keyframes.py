@@ -10,8 +10,7 @@ import pytest
 from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import exp_se3, motion_around
-from fields.map.keyframe_state import KeyframeRows, keyframe_arrays
-from fields.map.keyframes import KeyframeStore, RunningMedian
+from fields.map.keyframes import KeyframeRows, KeyframeStore, RunningMedian, keyframe_arrays
 from pipelines.select.keyframes import SeenPoints, covisibility
 
 CAMERA = PinholeCamera(10.0, 40.0, 4.0, 3.0, 8, 6)

@@ -114,16 +114,10 @@ class Up(nn.Module):
 
 
 def pixel_covariances(raw: torch.Tensor) -> torch.Tensor:
-    """Convert the network's outputs to covariances over (row, column).
+    """Convert the network's outputs (B, 3, H, W) to covariances (B, 3, H, W) over (row, column), as (rr, rc, cc).
 
     With the outputs (a, b, c): rr = exp(a) and cc = exp(b), each clamped to [1e-3, 1e4], and
     rc = 0.99 tanh(c) sqrt(rr cc - 1e-8).
-
-    Args:
-        raw: Outputs of the network (B, 3, H, W).
-
-    Returns:
-        Covariances (B, 3, H, W) as (rr, rc, cc).
     """
     low, high = math.log(MIN_VARIANCE), math.log(MAX_VARIANCE)
     rr = torch.exp(raw[:, 0].clamp(low, high))
@@ -154,12 +148,6 @@ class DepthCovWeights:
 
 def load_depthcov(path: Path) -> DepthCovWeights:
     """Read a checkpoint with the published 122 entries under `state_dict`, without running pickled code.
-
-    Args:
-        path: The checkpoint.
-
-    Returns:
-        The weights.
 
     Raises:
         ValueError: If an entry is missing, unexpected or of another shape (the message names it), or if the three
@@ -236,10 +224,7 @@ class DepthCov:
 
     @torch.inference_mode()
     def covariances(self, rgba: NDArray[np.uint8]) -> torch.Tensor:
-        """Run the network on an image.
-
-        Args:
-            rgba: Image (H, W, 4).
+        """Run the network on an image (H, W, 4).
 
         Returns:
             Covariances (1, 3, h, w) over (row, column) in [-1, 1]^2, with h and w multiples of 32.

@@ -61,12 +61,7 @@ class MapDepth:
     WINDOW = 5
 
     def __init__(self, renderer: Renderer, near: float) -> None:
-        """Create the estimator.
-
-        Args:
-            renderer: Renderer of the map.
-            near: Depth below which nothing is drawn [median depths of the view].
-        """
+        """Create the estimator. Nothing is drawn nearer than `near` [median depths of the view]."""
         self.renderer = renderer
         self.near = near
 
