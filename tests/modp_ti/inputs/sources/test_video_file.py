@@ -218,14 +218,6 @@ def test_files_that_are_no_videos_are_named(tmp_path):
             VideoFile(place)
 
 
-@pytest.mark.parametrize("text", ["ffconcat version 1.0\nfile room.mp4\n", "#EXTM3U\n#EXTINF:3,\nroom.mp4\n"])
-def test_lists_that_name_other_files_are_no_videos(mp4, text):
-    for name in ("list.mp4", "list.m3u8"):
-        (mp4.parent / name).write_text(text)
-        with pytest.raises(InputError, match=name):
-            VideoFile(mp4.parent / name)
-
-
 def test_frames_beyond_the_largest_image_are_refused(tmp_path, monkeypatch):
     from modp_ti.inputs.sources import video_file
 
