@@ -68,12 +68,6 @@ def test_cameras_of_linux_have_names_and_only_the_device_that_delivers_images_co
     assert sorted(n for what, n in log if what == "released") == [0, 10]
 
 
-def test_numbers_are_tried_where_the_system_lists_nothing(capture, tmp_path):
-    opening, _ = capture
-    opening |= {1: VGA}
-    assert find_cameras(tmp_path / "nothing") == [Camera(1, "", 640, 480, 30.0)]
-
-
 def listed(*arguments: str):
     return CliRunner().invoke(cli.app, ["cameras", *arguments])
 
