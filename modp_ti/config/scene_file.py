@@ -17,17 +17,14 @@ from pydantic_core import ErrorDetails
 from modp_ti.config.keys import as_yaml, differing_keys, documented_keys, dotted_keys, suggestion
 from modp_ti.config.presets import PRESETS, with_defaults
 from modp_ti.config.settings import SceneConfig
-from modp_ti.files import read_text
+from modp_ti.files import read_text, reading
 from modp_ti.files.atomic import replace_text
 from modp_ti.files.errors import FROM_FILE, InputError, shown_url
-from modp_ti.files.terminal import require_text
+from modp_ti.files.terminal import require_text, shown
 from modp_ti.files.yaml_text import parse_yaml
 from modp_ti.inputs.source_settings import WITH_SECRETS
 
 M = TypeVar("M", bound=BaseModel)
-
-# Limits of common file systems: bytes of a name and of a path.
-MAX_NAME, MAX_PATH = 255, 4095
 
 
 def load_scene(path: str | os.PathLike[str], overrides: Iterable[str] = (), preset: str | None = None) -> SceneConfig:
@@ -52,13 +49,8 @@ def load_scene(path: str | os.PathLike[str], overrides: Iterable[str] = (), pres
             config = modp_ti.load_scene("scene.yaml", ["source.scale=0.5", "output=out/half"])
     """
     file = Path(path)
-    try:
+    with reading(file):
         text = read_text(file)
-    except FileNotFoundError:
-        raise InputError(f"{file}: no such scene file") from None
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it holds bytes that are no text"
-        raise InputError(f"{file}: cannot be read as text: {reason}") from None
     lines: dict[str, int] = {}
     data = parse_yaml(text, str(file), lines)
     if not isinstance(data, dict):
@@ -184,7 +176,7 @@ def _no_such_kind(key: str, error: ErrorDetails) -> str:
         return f"{key} is missing: {_description(key)}"
     given = error["input"][key.rpartition(".")[2]]
     kinds = [entry.variant for entry in documented_keys(SceneConfig) if entry.key == key]
-    near = difflib.get_close_matches(str(given), kinds, n=1, cutoff=0.6)
+    near = difflib.get_close_matches(str(given), kinds, n=1)
     hint = f"; did you mean `{near[0]}`?" if near else ""
     return f"{key}: must be one of {', '.join(kinds)}, not {as_yaml(given)}{hint}"
 
@@ -217,13 +209,9 @@ def _with_absolute_paths(model: M, base: Path, typed: frozenset[str] = frozenset
 
 def _absolute_path(value: Path, base: Path, name: str) -> Path:
     """Resolve a path against `base`. Raises InputError for one that no file can have."""
-    longest = max(len(os.fsencode(part)) for part in (*value.parts, ""))
-    if "\0" in str(value) or longest > MAX_NAME or len(os.fsencode(value)) > MAX_PATH:
-        shown = f"{value}".replace("\0", "")[:40]
-        raise InputError(f"{name}: {shown}...: no file can be called that: it is too long, or holds a NUL character")
     try:
         path = (base / value.expanduser()).resolve()
         require_text(os.fspath(path))
         return path
-    except (RuntimeError, OSError) as error:  # no such user (`~name`), or a loop of symbolic links
-        raise InputError(f"{name}: {value}: is no path: {error}") from None
+    except (RuntimeError, OSError, ValueError) as error:  # no such user (`~name`), a loop of links, a NUL character
+        raise InputError(f"{name}: {shown(str(value))[:80]}: no file can be called that: {error}") from None

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -71,6 +72,20 @@ def splats_of(state: Mapping[str, NDArray], units: float, limit: int) -> Splats:
         np.round(255.0 * opacity[:, None]).astype(np.uint8),
         count,
     )
+
+
+def frustum_lines(poses: NDArray[np.float64], camera: PinholeCamera, units: float, depth: float) -> NDArray[np.float32]:
+    """Return the edges (8 N, 2, 3) of camera frustums in page units, for T_camera_world (N, 4, 4).
+
+    `units` is the number of page units per world unit, `depth` that of a frustum [page units].
+    """
+    w, h = camera.width, camera.height
+    corners = camera.unproject(np.array([[0.0, 0.0], [w, 0.0], [w, h], [0.0, h]]), np.full(4, depth))
+    centres = camera_centres(poses) * units
+    ends = centres[:, None] + np.einsum("nji,kj->nki", poses[:, :3, :3], corners)
+    sides = np.stack([np.broadcast_to(centres[:, None], ends.shape), ends], axis=2)
+    around = np.stack([ends, np.roll(ends, -1, axis=1)], axis=2)
+    return np.concatenate([sides, around], axis=1).reshape(-1, 2, 3).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -170,8 +185,6 @@ def picture_of(view: RenderedView, mode: str, scene_depth: float) -> NDArray[np.
 
 def scale_of(mode: str, scene_depth: float) -> str:
     """Return what the colours of a mode mean, as HTML: a bar with numbers. Empty for modes that need none."""
-    import cv2
-
     steps = np.linspace(0, 255, 9).round().astype(np.uint8)[None]
     turbo = cv2.applyColorMap(steps, cv2.COLORMAP_TURBO)[0, :, ::-1]
     if mode == "depth":  # `depth_colours`: red is near
@@ -224,8 +237,6 @@ def image_error(
     Returns:
         (H, W) mean absolute colour difference, NaN where the photograph does not show the place.
     """
-    import cv2
-
     z = view.expected_depth().astype(np.float64)
     row, column = np.mgrid[: camera.height, : camera.width]
     pixels = np.stack([column.ravel() + 0.5, row.ravel() + 0.5], axis=1)
@@ -255,8 +266,6 @@ def image_error(
 
 def error_picture(error: NDArray[np.float32]) -> NDArray[np.uint8]:
     """Return `image_error` as colours (H, W, 3): blue for 0, red for LARGEST_ERROR and more, dark grey for NaN."""
-    import cv2
-
     known = np.isfinite(error)
     scaled = eight_bits(np.where(known, error, 0.0) / LARGEST_ERROR)
     colours = cv2.applyColorMap(scaled, cv2.COLORMAP_TURBO)[..., ::-1]

@@ -14,7 +14,7 @@ from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import camera_centres, inverse_se3, quaternion_from_matrix
 from modp_ti.files.errors import InputError
 from modp_ti.outputs.viewer.handover import BrowserCamera, Gate, Requests
-from modp_ti.outputs.viewer.modes import MODES, SPLATS, Splats, scale_of
+from modp_ti.outputs.viewer.modes import MODES, SPLATS, Splats, frustum_lines, scale_of
 
 if TYPE_CHECKING:
     import viser
@@ -26,8 +26,6 @@ DEPTH_ON_PAGE = 4.0
 KEYFRAME_SIZE, FRAME_SIZE, POINT_SIZE = 0.12, 0.4, 0.006
 KEYFRAME_COLOUR, FRAME_COLOUR, POINT_COLOUR = (90, 140, 255), (255, 120, 30), (255, 60, 60)
 JPEG = {"format": "jpeg", "jpeg_quality": 85}
-# Corners of a frustum's image as (x, y) in {0, 1}.
-CORNERS = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
 # Names of the nodes of the scene, and the labels of the boxes of those that can be hidden.
 KEYFRAMES, FRAME, POINTS, SPLATS_NODE = "/keyframes", "/frame", "/points", "/splats"
 LABELS = {KEYFRAMES: "Keyframes", FRAME: "Current frame", POINTS: "Tracked points"}
@@ -272,7 +270,7 @@ class Page:
         """Show keyframes, given their T_camera_world (N, 4, 4), as frustums that all have the shape of `camera`."""
         style = {"colors": KEYFRAME_COLOUR, "thickness": 1.5, "thickness_units": "screen"}
         self._eyes = camera_centres(poses) * self.units
-        lines = frustum_lines(poses, camera, self.units)
+        lines = frustum_lines(poses, camera, self.units, KEYFRAME_SIZE)
         self._show(lambda scene, points: scene.add_line_segments(KEYFRAMES, points, **style), KEYFRAMES, points=lines)
 
     def show_points(self, xyz: NDArray[np.float64]) -> None:
@@ -388,17 +386,6 @@ class Page:
         """Return centre and target [page units], up direction and vertical field of view [rad] of a camera."""
         eye = inverse_se3(T_camera_world)[:3, 3] * self.units
         return eye, eye + DEPTH_ON_PAGE * T_camera_world[2, :3], -T_camera_world[1, :3], _vertical(camera)
-
-
-def frustum_lines(poses: NDArray[np.float64], camera: PinholeCamera, units: float) -> NDArray[np.float32]:
-    """Return the edges (8 N, 2, 3) of camera frustums in page units, for T_camera_world (N, 4, 4)."""
-    size = np.array([camera.width, camera.height])
-    corners = camera.unproject(CORNERS * size, np.full(4, KEYFRAME_SIZE))
-    centres = camera_centres(poses) * units
-    ends = centres[:, None] + np.einsum("nji,kj->nki", poses[:, :3, :3], corners)
-    sides = np.stack([np.broadcast_to(centres[:, None], ends.shape), ends], axis=2)
-    around = np.stack([ends, np.roll(ends, -1, axis=1)], axis=2)
-    return np.concatenate([sides, around], axis=1).reshape(-1, 2, 3).astype(np.float32)
 
 
 def _vertical(camera: PinholeCamera) -> float:

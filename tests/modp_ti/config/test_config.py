@@ -93,24 +93,34 @@ def test_a_wrong_override_is_named_as_it_was_typed(scene, override, parts):
     ("key", "value"),
     [
         *(("source.scale", value) for value in ("0", "1.5", '"0.5"', "true", ".nan", "1e999", "[0.5]", "half")),
-        *(("source.holdout", value) for value in ("1", "2.5")),
         *(("source.mask_colour", value) for value in ("[0, 0]", "[0, 0, 256]", "[1, 2, x]")),
-        *((f"source.{key}", "-1") for key in ("fps", "start", "mask_tolerance")),
+        *((key, "-1") for key in ("source.fps", "source.start", "source.holdout", "mapping.corrections.min_pixels")),
         *((key, "0") for key in ("source.step", "threads", "mapping.keyframes.max_gap")),
         *(("tracker.kind", value) for value in ("orb", "[colmap]", "null")),
+        *((key, "7") for key in ("tracker", "mapping", "tracker.path", "tracker.adjust", "device", "view")),
         *(("seed", value) for value in ("-1", "null")),
         ("source.stream", "[1]"),
-        ("tracker.adjust", "true"),
-        ("tracker.path", "3"),
-        ("tracker", "7"),
-        ("mapping", "7"),
-        ("mapping.corrections.min_pixels", "-1"),
-        ("mapping.exposure.enabled", "3"),
-        ("device", "gpu"),
     ],
 )
 def test_a_wrong_value_is_refused_with_its_key_and_origin(scene, key, value):
     assert failure(scene(), f"{key}={value}").startswith(f"--set {key}={value}:")
+
+
+@pytest.mark.parametrize(
+    ("text", "overrides", "enabled"),
+    [
+        ("", (), False),
+        ("view: {enabled: false, port: 9000}", (), False),
+        ("view: true", (), True),
+        ("view: {port: 9000}", (), True),
+        ("", ("view.port=9000",), True),
+        ("view: false", ("view.enabled=true",), True),
+    ],
+)
+def test_the_viewer_is_asked_for_by_a_word_or_a_section_and_shows_to_this_machine(scene, text, overrides, enabled):
+    view = load_scene(scene(f"{MINIMAL}{text}\n"), overrides).view
+    assert (view.enabled, view.host) == (enabled, "127.0.0.1")
+    assert view.port == (9000 if "9000" in text + str(overrides) else 8080)
 
 
 def test_a_wrong_value_of_several_types_is_refused_in_one_sentence(scene):
@@ -177,8 +187,8 @@ def test_a_bad_file_is_named_with_its_line(scene, text, part):
 
 
 def test_a_missing_scene_file_and_a_folder_are_named(tmp_path):
-    assert str(tmp_path / "no.yaml") in failure(tmp_path / "no.yaml")
-    assert str(tmp_path) in failure(tmp_path)
+    for path in (tmp_path / "no.yaml", tmp_path):
+        assert str(path) in failure(path)
 
 
 def test_numbers_are_those_of_yaml_1_2(scene):
@@ -319,9 +329,6 @@ def test_a_preset_sets_its_keys_where_nobody_else_does(scene, preset: str) -> No
     given = {"mapping": {"optimise": {"steps": 7}}}
     assert with_defaults(given, settings)["refine"] and given == {"mapping": {"optimise": {"steps": 7}}}
     assert "scene.yaml:4: mapping" in failure(scene(MINIMAL + "mapping: 7\n"), preset=preset)
-
-
-def test_an_unknown_preset_is_named(scene) -> None:
     assert "slow" in failure(scene(), preset="slow")
 
 

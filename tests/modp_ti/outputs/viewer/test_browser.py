@@ -1,13 +1,11 @@
-"""The page in a real browser, while a run maps: it shows the map and the lag, and its buttons hold the run."""
+"""The page in a real browser, while a run maps: it shows the map, and its buttons hold the run."""
 
 from __future__ import annotations
 
-import json
 import re
 import subprocess
 import sys
 import time
-import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -36,28 +34,16 @@ view:    {port: 0, paused: true}
 """
 
 
-# The same at the camera's pace, which nobody waits for while the run holds.
-LIVE = """
-source:  {path: images, fps: 10, realtime: true, intrinsics: {fx: 120, fy: 120, cx: 80, cy: 60}}
-tracker: {kind: klt}
-output:  out
-device:  cpu
-refine:  {steps: 0}
-export:  {report: false, session: true}
-view:    {port: 0, paused: true}
-"""
-
 pytestmark = [pytest.mark.slow, pytest.mark.browser]
 
 
 @pytest.fixture
-def run(tmp_path: Path, room: Room, request: pytest.FixtureRequest) -> Iterator[tuple[subprocess.Popen, str]]:
-    """A run of the scene, or of the one that the test gives, which holds after its first frame; where its page is."""
+def run(tmp_path: Path, room: Room) -> Iterator[tuple[subprocess.Popen, str]]:
+    """A run that holds after its first frame, and where its page is."""
     from tests.room import RoomRecording, pinhole, walk
 
-    scene = getattr(request, "param", SCENE)
-    RoomRecording(room, pinhole(160, 120) if scene == LIVE else pinhole(80, 60), walk(24)).write(tmp_path)
-    (tmp_path / "scene.yaml").write_text(scene)
+    RoomRecording(room, pinhole(80, 60), walk(24)).write(tmp_path)
+    (tmp_path / "scene.yaml").write_text(SCENE)
     command = [sys.executable, "-m", "modp_ti.run", str(tmp_path / "scene.yaml")]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     try:
@@ -134,30 +120,3 @@ def test_the_page_shows_the_map_and_its_buttons_hold_the_run(run: tuple[subproce
         wait_until(page, lambda: frame_number(page) == held + 1)
     # The browser is closed while the run is paused: it goes on, and ends well.
     assert process.wait(timeout=PATIENCE) == 0
-
-
-def shown_lag(page) -> tuple[int, str]:
-    """The number of frames and the lag [s] that the page shows; 0 before there is one."""
-    found = re.search(r"frame (\d+).*?lag ([\d.]+) s", page.locator("body").inner_text(), re.DOTALL)
-    return (int(found[1]), found[2]) if found else (0, "")
-
-
-@pytest.mark.parametrize("run", [LIVE], indirect=True)
-def test_the_page_shows_the_lag_that_the_session_records(run: tuple[subprocess.Popen, str], tmp_path: Path):
-    process, url = run
-    shown: dict[int, str] = {}
-    with chromium.open_page(url) as page:
-        wait_until(page, lambda: shown_lag(page)[0] == 1)
-        for number in (2, 3, 4, 5):  # the stream goes on meanwhile, so that each frame is later than the one before
-            page.get_by_role("button", name="Step").click()
-            wait_until(page, lambda number=number: shown_lag(page)[0] == number)
-            shown.update([shown_lag(page)])
-        page.get_by_role("button", name="Resume").click()
-        while process.poll() is None and "evaluating" not in page.locator("body").inner_text():
-            shown.update([shown_lag(page)])
-    assert process.wait(timeout=PATIENCE) == 0
-    with zipfile.ZipFile(tmp_path / "out" / "session.zip") as session:
-        lag = json.loads(session.read("about.json"))["lag"]
-    shown.pop(0, None)
-    assert len(shown) > 3
-    assert shown == {number: f"{lag[number - 1]:.1f}" for number in shown}

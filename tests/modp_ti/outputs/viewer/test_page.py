@@ -13,8 +13,8 @@ import pytest
 
 from fields.geometry.camera import PinholeCamera
 from modp_ti.files.errors import InputError
-from modp_ti.outputs.viewer.modes import Splats
-from modp_ti.outputs.viewer.page import DEPTH_ON_PAGE, KEYFRAME_SIZE, Page, ShownFrame, frustum_lines
+from modp_ti.outputs.viewer.modes import Splats, frustum_lines
+from modp_ti.outputs.viewer.page import DEPTH_ON_PAGE, KEYFRAME_SIZE, Page, ShownFrame
 from tests.patience import PATIENCE
 
 CAMERA = PinholeCamera(100.0, 100.0, 60.0, 40.0, 120, 80)
@@ -52,7 +52,7 @@ def test_frustums_have_their_tips_at_the_cameras_and_their_corners_in_the_images
         T[:3, :3] *= np.linalg.det(T[:3, :3])
         T[:3, 3] = rng.normal(size=3)
     units = 2.5
-    lines = frustum_lines(poses, CAMERA, units).reshape(3, 8, 2, 3)
+    lines = frustum_lines(poses, CAMERA, units, KEYFRAME_SIZE).reshape(3, 8, 2, 3)
     for T, edges in zip(poses, lines, strict=True):
         seen = (edges / units) @ T[:3, :3].T + T[:3, 3]
         np.testing.assert_allclose(seen[:4, 0], 0.0, atol=1e-6)
