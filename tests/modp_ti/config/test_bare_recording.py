@@ -126,8 +126,8 @@ def test_a_name_that_no_folder_can_have_is_shortened(folder):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["gone.yaml"], "gone.yaml: no such scene file"),
-        (["gone"], "gone: no such scene file"),
+        (["gone.yaml"], "gone.yaml: no such file"),
+        (["gone"], "gone: no such file"),
         (["room.mp4", "--stream", "0"], "--stream and --replay need no scene file and no --resume: give one of them"),
         (["room.mp4", "--replay", "out"], "--stream and --replay need no scene file and no --resume: give one of them"),
         (

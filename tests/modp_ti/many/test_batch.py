@@ -100,7 +100,7 @@ def test_a_batch_finishes_what_it_can_and_repeats_nothing(
     for name in SAME:
         assert (maps / "new" / name).read_bytes() == (finished / name).read_bytes(), name
     assert "no such folder of images" in results[2].error
-    assert results[3].error == f"{recordings / 'gone' / 'scene.yaml'}: no such scene file"
+    assert results[3].error == f"{recordings / 'gone' / 'scene.yaml'}: no such file"
     (stored,) = store.glob("new-*")
     assert (stored / "output" / "splats.ply").read_bytes() == (finished / "splats.ply").read_bytes()
     assert not (stored / "snapshot.npz").exists()
@@ -111,7 +111,7 @@ def test_a_batch_finishes_what_it_can_and_repeats_nothing(
     page = (folder / "index.html").read_text()
     for name in ("done", "new"):
         assert f'<a href="../maps/{name}/report.html">{name}</a>' in page
-    assert "no such scene file" in page
+    assert "no such file" in page
 
     # The same command again, and once more where nothing is left but the storage.
     kept = times(maps)
