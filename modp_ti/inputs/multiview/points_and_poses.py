@@ -204,10 +204,12 @@ def adjusted_poses(
                 poses[i], moved[i] = T, True
             numbers, places = found[1:]
             xyz[numbers] = places
-        _carry_along(poses, before, moved)
+        there = np.flatnonzero(moved)
         for i in np.flatnonzero(~moved):
-            mine = agreeing.where(agreeing.frame == i)
-            poses[i] = _resected(poses[i], mine, xyz, width)
+            if len(there):
+                k = there[np.argmin(np.abs(there - i))]
+                poses[i] = before[i] @ inverse_se3(before[k]) @ poses[k]
+            poses[i] = _resected(poses[i], agreeing.where(agreeing.frame == i), xyz, width)
     return np.stack([orthonormalised(T) for T in poses])
 
 
@@ -275,16 +277,6 @@ def _alignment(
     if not s > 0:  # the given camera centres are noise
         s = 1.0
     return s, R, mean_b - s * R @ mean_a
-
-
-def _carry_along(poses: NDArray[np.float64], before: NDArray[np.float64], moved: NDArray[np.bool_]) -> None:
-    """Move each frame that was not adjusted rigidly with the adjusted frame that is nearest in time, in place."""
-    there = np.flatnonzero(moved)
-    if len(there) == 0:
-        return
-    for i in np.flatnonzero(~moved):
-        k = there[np.argmin(np.abs(there - i))]
-        poses[i] = before[i] @ inverse_se3(before[k]) @ poses[k]
 
 
 def _resected(
