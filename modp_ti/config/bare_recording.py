@@ -38,10 +38,7 @@ SCENE_SUFFIXES, PACKED = (".yaml", ".yml", ".json", ".txt"), (".tar", ".gz", ".t
 # Kinds whose poses may lie in a folder of images, in the order in which they are looked for.
 IN_FOLDERS = ("transforms", "colmap", "tum")
 Say = Callable[[str], None]
-
-
-def _silent(what: str) -> None:
-    """Notes that nobody reads."""
+SILENT: Say = lambda _: None  # noqa: E731
 
 
 def is_recording(path: Path) -> bool:
@@ -61,7 +58,7 @@ def named_scene(
     overrides: Iterable[str] = (),
     preset: str | None = None,
     taken: Collection[Path] = (),
-    say: Say = _silent,
+    say: Say = SILENT,
 ) -> SceneConfig:
     """Return the settings of a scene file or, as `recorded_scene` does and with its arguments, of a recording.
 
@@ -85,7 +82,7 @@ def recorded_scene(
     overrides: Iterable[str] = (),
     preset: str | None = None,
     taken: Collection[Path] = (),
-    say: Say = _silent,
+    say: Say = SILENT,
 ) -> SceneConfig:
     """Return the settings for a video, a VRS recording, a capture, a ROS bag or a folder that has no scene file.
 
@@ -117,7 +114,7 @@ def recorded_scene(
     output = _free(name, images, taken)
 
     def settings(tracker: dict[str, Any], *more: str) -> SceneConfig:
-        scene = _scene({"path": str(images)}, output, tracker)
+        scene = {"source": {"path": str(images)}, "tracker": tracker, "output": str(output)}
         return scene_from_data(scene, str(path), [*overrides, *more], preset)
 
     kinds = IN_FOLDERS if kind == "images" else [kind_of(SOURCES[kind])] if kind in SOURCES else []
@@ -186,11 +183,8 @@ def streamed_scene(stream: str, overrides: Iterable[str] = (), preset: str | Non
         InputError: As for `load_scene`.
     """
     source = {"stream": int(stream) if stream.isdecimal() else stream}
-    return scene_from_data(_scene(source, _free(_stream_name(stream)), {"kind": "klt"}), "--stream", overrides, preset)
-
-
-def _scene(source: dict[str, Any], output: Path, tracker: dict[str, Any]) -> dict[str, Any]:
-    return {"source": source, "tracker": tracker, "output": str(output)}
+    scene = {"source": source, "tracker": {"kind": "klt"}, "output": str(_free(_stream_name(stream)))}
+    return scene_from_data(scene, "--stream", overrides, preset)
 
 
 def _stream_name(stream: str) -> str:

@@ -1,20 +1,220 @@
-"""The log that a run keeps of every frame that its tracker delivered, with all corrections."""
+"""The log that a run keeps of every frame that its tracker delivered and of its points, with all corrections."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fields.frames.origin import NO_ORIGIN
-from fields.frames.pose_correction import PoseCorrection
+from fields.frames.pose_correction import CameraRevision, PoseCorrection
 from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from fields.map.trajectory import Trajectory
+from modp_ti.inputs.multiview.points_and_poses import placed_anew
+from modp_ti.inputs.multiview.reprojection import Observations
 from modp_ti.inputs.protocol import Tracker
-from modp_ti.inputs.tracked_points import TrackedPoints
+from modp_ti.inputs.rows_of_ids import RowsOfIds
+from pipelines.safeguards import OBSERVATION
+
+# Colour of a point seen only by held-out frames. Held-out pixels must not leak into data that others train on.
+UNSEEN = (128, 128, 128)
+# Memory of a point [bytes].
+POINT = 64
+# Rows and pixels of a frame without observations.
+NOTHING = np.zeros(0, np.int32), np.zeros((0, 2), np.float32)
+
+
+class TrackedPoints:
+    """Points by tracker id, with the observations of each frame.
+
+    An observation takes 12 bytes, a point 64.
+
+    Attributes:
+        rows: Per frame, rows (N,) int32 of `xyz` of the points that the frame observed. Empty if the frame was added
+            with `leave_out`.
+        pixels: Per frame, the pixels (N, 2) float32 of these points.
+    """
+
+    def __init__(self) -> None:
+        self.rows: list[NDArray[np.int32]] = []
+        self.pixels: list[NDArray[np.float32]] = []
+        self._held_out: list[bool] = []
+        self._row_of = RowsOfIds()
+        self._xyz = np.zeros((0, 3))
+        self._colours = np.zeros((0, 4), dtype=np.uint32)  # sums of red, green and blue, and the number of samples
+        self._last = np.zeros((0, 1), dtype=np.int32)  # the last frame that observed the point
+        self._observations = 0
+
+    def __len__(self) -> int:
+        return len(self._row_of)
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of points and observations [bytes]."""
+        return self._observations * OBSERVATION + len(self) * POINT
+
+    def add(self, frame: TrackedFrame) -> None:
+        """Record the observations of the next frame. A point takes the position given by the latest frame."""
+        points = frame.points
+        rows = self._row_of.take(points.ids).astype(np.int32)
+        self._grow(len(self))
+        self._xyz[rows] = points.xyz
+        self._last[rows, 0] = len(self.rows)
+        if not frame.held_out:
+            column, row = np.floor(points.pixels).astype(int).T
+            rgba = frame.rgba[row, column]
+            seen = rgba[:, 3] > 0
+            np.add.at(self._colours, rows[seen], np.c_[rgba[seen, :3], np.ones(seen.sum(), dtype=np.uint32)])
+        self._append(rows, points.pixels.astype(np.float32), frame.held_out)
+
+    def leave_out(self, frame: TrackedFrame) -> None:
+        """Record the next frame without its observations."""
+        self._append(*NOTHING, frame.held_out)
+
+    def _append(self, rows: NDArray[np.int32], pixels: NDArray[np.float32], held_out: bool) -> None:
+        self.rows.append(rows)
+        self.pixels.append(pixels)
+        self._held_out.append(held_out)
+        self._observations += len(rows)
+
+    def correct(
+        self, ids: NDArray[np.int64], xyz: NDArray[np.float64], motions: Mapping[int, NDArray[np.float64]]
+    ) -> None:
+        """Apply a correction of the tracker's map.
+
+        Ids that no frame observed are ignored. Points that are not in `ids` move with the last frame that observed
+        them.
+
+        Args:
+            ids: Ids (N,) of the corrected points.
+            xyz: Their new world positions (N, 3).
+            motions: Similarity S_after_before (4, 4) of the world around each frame whose world moved, by its place
+                among the frames.
+        """
+        last, places = self._last[: len(self), 0], self.xyz
+        frames = np.array(sorted(motions), dtype=np.int64)
+        moving = np.flatnonzero(np.isin(last, frames))
+        if len(moving):
+            S = np.stack([motions[frame] for frame in frames.tolist()])[np.searchsorted(frames, last[moving])]
+            places[moving] = np.einsum("nij,nj->ni", S[:, :3, :3], places[moving]) + S[:, :3, 3]
+        rows = self._row_of.find(ids)
+        places[rows[rows >= 0]] = xyz[rows >= 0]
+
+    def revise_camera(self, revision: CameraRevision) -> None:
+        """Move all observations to the images of a new camera. Those that leave the image are dropped."""
+        for i, (rows, pixels) in enumerate(zip(self.rows, self.pixels, strict=True)):
+            moved = revision.pixels(pixels)
+            kept = revision.camera.contains(moved)
+            self.rows[i], self.pixels[i] = rows[kept], moved[kept].astype(np.float32)
+            self._observations -= int(np.count_nonzero(~kept))
+
+    def state(self) -> dict[str, NDArray]:
+        """Return the complete state as arrays, for `restore`."""
+        return {
+            "counts": np.array([len(rows) for rows in self.rows], dtype=np.int64),
+            "rows": np.concatenate([*self.rows, NOTHING[0]]),
+            "pixels": np.concatenate([*self.pixels, NOTHING[1]]),
+            "ids": self.ids,
+            "xyz": self.xyz,
+            "colours": self._colours[: len(self)],
+            "last": self._last[: len(self)],
+        }
+
+    def restore(self, state: Mapping[str, NDArray], held_out: Sequence[bool]) -> None:
+        """Restore a state returned by `state`.
+
+        Args:
+            state: The arrays.
+            held_out: Whether each frame is held out.
+        """
+        cuts = np.cumsum(state["counts"])[:-1]
+        self.rows = np.split(state["rows"], cuts) if held_out else []
+        self.pixels = np.split(state["pixels"], cuts) if held_out else []
+        self._held_out = list(held_out)
+        self._observations = len(state["rows"])
+        self._row_of = RowsOfIds(state["ids"])
+        self._xyz, self._colours, self._last = state["xyz"], state["colours"], state["last"]
+
+    def _grow(self, count: int) -> None:
+        if count <= len(self._xyz):
+            return
+        size = max(count, 2 * len(self._xyz))
+        for name in ("_xyz", "_colours", "_last"):
+            old = getattr(self, name)
+            new = np.zeros((size, old.shape[1]), dtype=old.dtype)
+            new[: len(old)] = old
+            setattr(self, name, new)
+
+    @property
+    def ids(self) -> NDArray[np.int64]:
+        """Tracker ids (P,) of the points."""
+        return self._row_of.ids
+
+    @property
+    def xyz(self) -> NDArray[np.float64]:
+        """World positions (P, 3)."""
+        return self._xyz[: len(self)]
+
+    @property
+    def colours(self) -> NDArray[np.uint8]:
+        """Mean colours (P, 3) over valid pixels of the frames that are not held out; `UNSEEN` where there are none."""
+        sums = self._colours[: len(self)]
+        mean = np.round(sums[:, :3] / np.maximum(sums[:, 3:], 1)).astype(np.uint8)
+        mean[sums[:, 3] == 0] = UNSEEN
+        return mean
+
+    def reprojection_error(
+        self, cameras: list, poses: list[NDArray[np.float64]], places: NDArray[np.float64] | None = None
+    ) -> float | None:
+        """Compute the mean reprojection error [px] over all observations in front of the camera.
+
+        Args:
+            cameras: Camera of each frame.
+            poses: T_camera_world (4, 4) of each frame.
+            places: World positions (P, 3) to use instead of `xyz`.
+
+        Returns:
+            The mean error, or None if there are no observations in front of the camera.
+        """
+        xyz = self.xyz if places is None else places
+        total, count = 0.0, 0
+        for camera, T, rows, pixels in zip(cameras, poses, self.rows, self.pixels, strict=True):
+            p = xyz[rows] @ T[:3, :3].T + T[:3, 3]
+            before = p[:, 2] > 0
+            total += float(np.linalg.norm(camera.project(p[before]) - pixels[before], axis=1).sum())
+            count += int(before.sum())
+        return total / count if count else None
+
+    def placed_anew(self, cameras: list, poses: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+        """Triangulate the points again for given poses, using only frames that are not held out.
+
+        A point keeps its position if fewer than two of these frames observe it, or if the new position does not reduce
+        its robust reprojection error.
+
+        Args:
+            cameras: Camera of each frame.
+            poses: T_camera_world (4, 4) of each frame.
+
+        Returns:
+            World positions (P, 3).
+        """
+        if len(self) == 0:
+            return self.xyz
+        rays = [
+            (pixels.astype(np.float64) - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+            for camera, pixels in zip(cameras, self.pixels, strict=True)
+        ]
+        counts = [len(rows) for rows in self.rows]
+        seen = Observations(
+            np.repeat(np.arange(len(counts)), counts),
+            np.concatenate(self.rows).astype(np.int64),
+            np.concatenate(rays),
+            np.repeat([1.0 / camera.fx for camera in cameras], counts),
+        )
+        return placed_anew(np.stack(poses), seen, self.xyz, ~np.array(self._held_out))
 
 
 @dataclass

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar, Protocol
@@ -167,9 +168,5 @@ def shift_after(last: float, first: float) -> float:
 
 def prefix_for(names: Iterable[str]) -> str:
     """Return the prefix of the names of the next visit to a map whose frames have these names: `visit2/`, ..."""
-    visits = [int(part[5:]) for part in {name.partition("/")[0] for name in names} if _is_visit(part)]
-    return f"visit{max(visits, default=1) + 1}/"
-
-
-def _is_visit(part: str) -> bool:
-    return part.startswith("visit") and part[5:].isdecimal()
+    visits = (re.match(r"visit([0-9]+)/", name) for name in names)
+    return f"visit{max((int(visit[1]) for visit in visits if visit), default=1) + 1}/"

@@ -16,8 +16,8 @@ from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import inverse_se3
 from modp_ti.files.atomic import write_picture, written_aside
 from modp_ti.files.errors import InputError
+from modp_ti.inputs.delivered_frames import TrackedPoints
 from modp_ti.inputs.sources import Picture
-from modp_ti.inputs.tracked_points import TrackedPoints
 
 # Converts OpenCV camera axes to OpenGL camera axes.
 OPENGL_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])

@@ -12,7 +12,7 @@ import pytest
 from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from fields.runtime.backend import initialise
 from modp_ti.engine.mapper import Mapper
-from modp_ti.inputs.tracked_points import TrackedPoints
+from modp_ti.inputs.delivered_frames import TrackedPoints
 from pipelines.companions.block_files import BlockError
 from pipelines.settings import MappingSettings
 from tests.pipelines.wall import frame, walked_along

@@ -11,9 +11,9 @@ import pytest
 
 from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from fields.geometry.camera import PinholeCamera
+from modp_ti.inputs.delivered_frames import TrackedPoints
 from modp_ti.inputs.readers.colmap import ColmapSettings
 from modp_ti.inputs.source_settings import SourceSettings
-from modp_ti.inputs.tracked_points import TrackedPoints
 from modp_ti.outputs.formats.dataset import image_names, write_colmap, write_image
 from tests.opening import opened_with
 
