@@ -1,26 +1,109 @@
-"""Poses in files: lines in TUM format, quaternions and matrices."""
+"""Tables of numbers and poses in text files: lines of numbers, trajectories in TUM format, quaternions and matrices."""
 
 from __future__ import annotations
 
+import math
+from array import array
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fields.geometry.se3 import inverse_poses, matrices_from_unit_quaternions
+from modp_ti.files import LARGEST, input_lines
 from modp_ti.files.errors import InputError
-from modp_ti.files.number_rows import NumberRows, read_number_rows
 
 FARTHEST = 1e12
 """Largest valid coordinate [scene units]. Squared coordinates must fit the map's float32."""
 
-MATRICES: dict[int, str] = dict.fromkeys((12, 16), "; a matrix in each line is tracker.kind: matrices")
+# What rows of so many columns are, for error messages.
+FORMS = {8: "; a time, a position and a quaternion are tracker.kind: tum"}
+FORMS |= dict.fromkeys((12, 16), "; a matrix in each line is tracker.kind: matrices")
 
 # Largest deviation of a quaternion's length from 1. Rounding in text files stays below it.
 MAX_LENGTH_ERROR = 1e-2
 # Largest deviation of R^T R from the identity. Rounding in text files stays below it.
 MAX_ROTATION_DEFECT = 1e-2
+
+
+@dataclass(frozen=True)
+class NumberRows:
+    """The rows of a text table.
+
+    Attributes:
+        path: The file.
+        values: (N, columns).
+        lines: (N,) line of each row in the file, from 1.
+        left_out: Number of rows that were skipped because they contain NaN or Inf, or are lost.
+    """
+
+    path: Path
+    values: NDArray[np.float64]
+    lines: NDArray[np.int64]
+    left_out: int = 0
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def where(self, row: int) -> str:
+        """File and line of a row, for messages."""
+        return f"{self.path}:{self.lines[row]}"
+
+
+def read_number_rows(
+    path: Path,
+    columns: int,
+    meaning: str,
+    setting: str = "tracker.path",
+    more: bool = False,
+    few: float = 0.0,
+    least: int = 1,
+    quaternion: slice | None = None,
+) -> NumberRows:
+    """Read a text table whose rows have `columns` finite numbers each.
+
+    Args:
+        path: The file.
+        columns: Numbers per row.
+        meaning: The columns in words, for error messages.
+        setting: The configuration key that names the file, for error messages.
+        more: Accept and ignore further columns.
+        few: Largest share of the rows that may contain NaN or Inf; these rows are skipped.
+        least: Least number of rows, 0 or 1.
+        quaternion: Where a row has a quaternion; rows in which it is zero are skipped as those with NaN are.
+
+    Raises:
+        InputError: With file and line, if a row has another number of columns, text, too many rows contain NaN or Inf,
+            or a number exceeds `LARGEST`; also if the file cannot be read or has no rows.
+    """
+    values, lines = array("d"), array("q")
+    bad: list[int] = []
+    for number, line in enumerate(input_lines(path, f" ({setting})"), start=1):
+        words = line.split("#", 1)[0].replace(",", " ").split()
+        if not words:
+            continue
+        if len(words) < columns or (len(words) > columns and not more):
+            kind = FORMS.get(len(words), "")
+            raise InputError(f"{path}:{number}: holds {len(words)} columns instead of {columns}: {meaning}{kind}")
+        try:
+            row = [float(word) for word in words[:columns]]
+        except ValueError:
+            raise InputError(f"{path}:{number}: not a row of numbers: {meaning}") from None
+        if not all(map(math.isfinite, row)) or (quaternion is not None and not any(row[quaternion])):
+            bad.append(number)
+            continue
+        if max(map(abs, row)) > LARGEST:
+            raise InputError(f"{path}:{number}: holds a number beyond {LARGEST:g}; the file is damaged")
+        values.extend(row)
+        lines.append(number)
+    if len(bad) > few * (len(lines) + len(bad)):
+        raise InputError(f"{path}:{bad[0]}: holds NaN or infinite numbers, or a quaternion of zeros; take the line out")
+    if len(lines) < least:
+        raise InputError(f"{path}: holds no row of {meaning} ({setting})")
+    rows = np.frombuffer(values).reshape(-1, columns)
+    return NumberRows(path, rows, np.frombuffer(lines, dtype=np.int64), len(bad))
 
 
 def read_tum_rows(path: Path, setting: str = "tracker.path", few: float = 0.0, least: int = 1) -> NumberRows:
@@ -29,11 +112,7 @@ def read_tum_rows(path: Path, setting: str = "tracker.path", few: float = 0.0, l
     Trackers that are lost write NaN or a quaternion of zeros.
     """
     meaning = "time tx ty tz qx qy qz qw"
-    return read_number_rows(path, 8, meaning, setting, few=few, least=least, lost=_is_lost, others=MATRICES)
-
-
-def _is_lost(row: list[float]) -> bool:
-    return not any(row[4:8])
+    return read_number_rows(path, 8, meaning, setting, few=few, least=least, quaternion=slice(4, 8))
 
 
 def tum_poses(rows: NumberRows) -> NDArray[np.float64]:

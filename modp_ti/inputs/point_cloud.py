@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from fields.frames.tracked_frame import SparsePoints
 from modp_ti.files import open_file, read_bytes, reading
 from modp_ti.files.errors import InputError
-from modp_ti.files.number_rows import read_number_rows
 from modp_ti.files.ply import parse_ply_header
-from modp_ti.files.trajectory import FARTHEST
+from modp_ti.files.trajectory import FARTHEST, read_number_rows
 from modp_ti.inputs.replay import PosedImage, points_inside
 from modp_ti.inputs.sources import Undistorter
 

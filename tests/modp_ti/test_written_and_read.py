@@ -17,7 +17,7 @@ from hypothesis.extra import numpy as arrays
 
 from fields.geometry.se3 import exp_se3
 from modp_ti.files import parse_json
-from modp_ti.files.number_rows import read_number_rows
+from modp_ti.files.trajectory import read_number_rows
 from modp_ti.inputs.point_cloud import read_ply_points
 from modp_ti.inputs.readers.aria import read_csv_blocks
 from modp_ti.inputs.tracker_server.messages import Kind, State, encoded, parse_correction, parse_frame

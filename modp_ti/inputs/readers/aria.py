@@ -16,8 +16,7 @@ from pydantic import Field
 from fields.geometry.se3 import inverse_poses
 from modp_ti.files import LARGEST, input_lines, open_file, parse_json, reading
 from modp_ti.files.errors import InputError
-from modp_ti.files.number_rows import NumberRows
-from modp_ti.files.trajectory import poses_of_quaternions
+from modp_ti.files.trajectory import NumberRows, poses_of_quaternions
 from modp_ti.inputs.point_cloud import spread_points
 from modp_ti.inputs.posed_recording import PosedRecording
 from modp_ti.inputs.reader import TimedPosesSettings

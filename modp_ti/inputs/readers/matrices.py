@@ -8,13 +8,12 @@ from typing import ClassVar, Literal
 from pydantic import Field
 
 from modp_ti.files import input_lines
-from modp_ti.files.number_rows import read_number_rows
+from modp_ti.files.trajectory import read_number_rows
 from modp_ti.inputs.capture import opencv_pose
 from modp_ti.inputs.posed_recording import PosedRecording
 from modp_ti.inputs.reader import GivenPosesSettings
 
 MEANING = "a 3x4 or 4x4 matrix, camera to world, row by row"
-OTHERS = {8: "; a time, a position and a quaternion are tracker.kind: tum"}
 
 
 class MatricesSettings(GivenPosesSettings):
@@ -35,6 +34,6 @@ class MatricesSettings(GivenPosesSettings):
         )
         lines = (line.partition("#")[0].replace(",", " ").split() for line in input_lines(file, " (tracker.path)"))
         columns = 16 if len(next(filter(None, lines), [])) == 16 else 12
-        rows = read_number_rows(file, columns, MEANING, others=OTHERS)
+        rows = read_number_rows(file, columns, MEANING)
         poses = {n: opencv_pose(row, rows.where(n)) for n, row in enumerate(rows.values)}
         self.give_by_number(recording, file, poses)

@@ -16,7 +16,7 @@ from fields.geometry.camera import PinholeCamera
 from modp_ti.files import LARGEST
 from modp_ti.files.errors import InputError
 from modp_ti.files.file_tree import FileTree
-from modp_ti.files.number_rows import read_number_rows
+from modp_ti.files.trajectory import read_number_rows
 from modp_ti.inputs.capture import rigid_motion
 from modp_ti.inputs.point_cloud import projected_points, read_npy_points
 from modp_ti.inputs.posed_recording import PosedRecording, read_entries

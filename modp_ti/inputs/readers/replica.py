@@ -13,7 +13,7 @@ from pydantic import Field
 from fields.geometry.camera import PinholeCamera
 from modp_ti.files.errors import InputError
 from modp_ti.files.file_tree import FileTree
-from modp_ti.files.number_rows import read_number_rows
+from modp_ti.files.trajectory import read_number_rows
 from modp_ti.inputs.capture import opencv_pose
 from modp_ti.inputs.posed_recording import PosedRecording
 from modp_ti.inputs.reader import GivenPosesSettings

@@ -31,11 +31,6 @@ def video(file: Path) -> None:
     writer.release()
 
 
-def listing(folder: Path) -> None:
-    image(folder / "rgb" / "1.png", 640, 480)
-    (folder / "rgb.txt").write_text("1.0 rgb/1.png\n2.0 rgb/2.png\n")
-
-
 # What lies beside the scene file, and the name and size of an image that it then gives.
 DATA = {
     "A folder of images": (lambda at: image(at / "images/frame2.jpg", 64, 48), "frame2.jpg", (64, 48)),
@@ -46,14 +41,12 @@ DATA = {
         "0001-face3.png",
         (194, 194),
     ),
-    "TUM RGB-D": (lambda at: listing(at / "rgbd_dataset_freiburg1_desk"), "rgb/1.png", (640, 480)),
     "Your own intrinsics": (lambda at: image(at / "images/a.png", 640, 480), "a.png", (640, 480)),
 }
 WITHOUT_DATA = {"A camera or a stream", "Project Aria recordings"}
 # Sections whose source tells the camera; the others leave it to the tracker.
 WITH_CAMERA = {
     "Panoramas: images that see all round",
-    "TUM RGB-D",
     "Your own intrinsics",
 }
 
