@@ -50,7 +50,7 @@ FAULTY = """
 import sys
 
 def look(event, arguments):
-    if event == "open" and str(arguments[0]).endswith("metrics.json"):
+    if event == "import" and arguments[0] == "modp_ti.engine.resume":
         raise ZeroDivisionError("of all things")
 
 sys.addaudithook(look)
