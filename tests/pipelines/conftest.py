@@ -23,7 +23,8 @@ def renderers(taichi_on_the_cpu: None) -> Callable[..., Renderer]:
     living: dict[tuple[int, object], Renderer] = {}
 
     def renderer(degree: int = 0, real: object = ti.f32) -> Renderer:
-        if (degree, real) not in living:
+        held = living.get((degree, real))
+        if held is None or not held.gaussians.tenancy.is_open:  # or a test between them has started Taichi anew
             if living:
                 initialise("cpu")
                 living.clear()
