@@ -101,25 +101,6 @@ class EarlierMap:
         return {"onto": None, "parts": None}
 
 
-def open_earlier_map(config: SceneConfig, line: ProgressLine) -> EarlierMap:
-    """Return the map that a run starts with.
-
-    Args:
-        config: The scene's settings.
-        line: Shows the progress.
-
-    Raises:
-        InputError: If there is no finished run to go on with, or a damaged one.
-    """
-    if config.onto is not None:
-        return SecondVisit(config, line)
-    if config.parts is None:
-        return EarlierMap()
-    from modp_ti.many.parts import MergedParts  # here, because it loads what many runs need
-
-    return MergedParts(config)
-
-
 class SecondVisit(EarlierMap):
     """Finds the place of a recording in a finished map, and goes on with that map.
 

@@ -17,11 +17,12 @@ from fields.runtime.backend import describe, initialise
 from modp_ti.config.settings import SceneConfig
 from modp_ti.engine.interruption import Interruption
 from modp_ti.engine.mapper import Mapper, build_mapper
+from modp_ti.engine.parts import MergedParts
 from modp_ti.engine.realtime import open_conductor
 from modp_ti.engine.recording import RecordedSession
 from modp_ti.engine.results import Results, RunClock, remarks
 from modp_ti.engine.resume import Recovery, replay, saving
-from modp_ti.engine.second_visit import EarlierMap, open_earlier_map
+from modp_ti.engine.second_visit import EarlierMap, SecondVisit
 from modp_ti.engine.snapshot import Checkpointer, Snapshot
 from modp_ti.engine.stream import Conductor, FramesAhead, Observer, open_observer
 from modp_ti.files.errors import InputError, without_secrets
@@ -144,7 +145,10 @@ def open_run(
     say(*process.notes)
     began = time.perf_counter()
     stop = held.enter_context(Interruption(lambda: line.note("stopping after this step; Ctrl-C again stops at once")))
-    earlier = open_earlier_map(config, line)
+    if config.onto is not None:
+        earlier: EarlierMap = SecondVisit(config, line)
+    else:
+        earlier = EarlierMap() if config.parts is None else MergedParts(config)
     tracker = replayed or open_tracker(config, line.prepare)
     held.callback(tracker.close)
     recovery = Recovery(config, tracker)

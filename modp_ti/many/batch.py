@@ -27,7 +27,8 @@ from modp_ti.many.results import (
     write_parquet,
     write_summary_page,
 )
-from modp_ti.many.task import PATIENCE, End, fetch_finished, finished_metrics
+from modp_ti.many.task import PATIENCE, End, fetch_finished
+from modp_ti.outputs.playback.finished_run import finished_metrics
 
 CSV, PARQUET, PAGE, LOGS = "batch.csv", "batch.parquet", "index.html", "logs"
 # Longest wait for an event [s]: how often the table is brought up to date at least.

@@ -85,7 +85,7 @@ def figures(metrics: Mapping[str, Any]) -> dict[str, Any]:
 
     Scores are the means over the held-out frames of the final map, or over all frames (`scored`).
     """
-    stage = last_stage(metrics)
+    stage = metrics[facts.last_stage(metrics)]
     scored = "held_out" if stage["held_out"]["count"] else "all"
     of_run = ("frames", "keyframes", "gaussians", "frames_per_second", "peak_memory_mb", "ate_rmse")
     return {
@@ -95,11 +95,6 @@ def figures(metrics: Mapping[str, Any]) -> dict[str, Any]:
         "seconds": metrics["seconds"]["total"],
         "resumed": metrics["snapshots"]["resumed"],
     }
-
-
-def last_stage(metrics: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the entry of the final map in the content of `metrics.json`."""
-    return next(metrics[stage] for stage in ("refined", "online", "offline") if metrics.get(stage))
 
 
 def write_csv(path: Path, results: Sequence[SceneResult]) -> None:

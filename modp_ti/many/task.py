@@ -15,21 +15,17 @@ from enum import Enum
 from pathlib import Path
 from typing import Any
 
-from modp_ti.config.keys import differing_keys
 from modp_ti.config.scene_file import load_scene, scene_from_data
 from modp_ti.config.settings import SceneConfig
-from modp_ti.files import read_json
 from modp_ti.files.errors import InputError
 from modp_ti.files.processes import child_environment
-from modp_ti.files.run_folder import appearing, require_whole, sole_use
+from modp_ti.files.run_folder import appearing, sole_use
 from modp_ti.files.storage import Storage, StorageError
+from modp_ti.outputs.playback.finished_run import METRICS, SETTINGS, finished_metrics, made_with
 from modp_ti.outputs.progress import StageProgress
 
-# Settings on which neither the map nor the other output files depend, but for the device, in the last digits.
-FREE = ("output", "device", "threads", "snapshot_every", "snapshot_store", "source.prefetch", "view")
 # Folder of the finished run's files within the scene's storage.
 OUTPUT = "output"
-METRICS, SETTINGS = "metrics.json", "config.yaml"
 # Time that a task gets to save what it has when it is to end, or when the process that began it is gone [s].
 PATIENCE = 60.0
 # Time between two lines of progress in the log of a task [s].
@@ -216,24 +212,6 @@ def _end_with_parent() -> None:
 # ---- what it leaves --------------------------------------------------------------------------------------------------
 
 
-def finished_metrics(config: SceneConfig) -> dict[str, Any] | None:
-    """Return the metrics of a finished run with these settings in `config.output`, None if there is none.
-
-    A run with further maps (`tracker.maps: all`) is finished when all of them are.
-    """
-    try:
-        require_whole(config.output)
-        metrics = read_json(config.output / METRICS, METRICS)
-        written = load_scene(config.output / SETTINGS)
-        further = int(metrics.get("further_maps", 0))
-    except (InputError, AttributeError, TypeError, ValueError):
-        return None
-    if not _same(written, config):
-        return None
-    maps = [config.of_map(place).output / METRICS for place in range(2, 2 + further)]
-    return metrics if all(file.is_file() for file in maps) else None
-
-
 def fetch_finished(config: SceneConfig) -> bool:
     """Copy the files of a finished run from `snapshot_store` to the output folder, unless it has them already.
 
@@ -248,7 +226,7 @@ def fetch_finished(config: SceneConfig) -> bool:
         with tempfile.TemporaryDirectory(prefix="modp-ti-batch-") as folder:
             file = Path(folder) / SETTINGS
             try:
-                stored = storage.has(METRICS) and storage.get(SETTINGS, file) and _same(load_scene(file), config)
+                stored = storage.has(METRICS) and storage.get(SETTINGS, file) and made_with(load_scene(file), config)
             except StorageError:
                 raise
             except InputError:
@@ -257,10 +235,3 @@ def fetch_finished(config: SceneConfig) -> bool:
             with appearing(config.output) as staged:
                 storage.get_folder(staged)
     return finished_metrics(config) is not None
-
-
-def _same(written: SceneConfig, config: SceneConfig) -> bool:
-    scale = written.source.scale
-    if scale != "auto":  # the run's number, which `auto` in the scene file became
-        config = config.resolved(scale)
-    return not differing_keys(written.model_dump(mode="json"), config.model_dump(mode="json"), FREE)

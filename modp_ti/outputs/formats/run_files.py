@@ -259,7 +259,7 @@ def read_scores(path: str | os.PathLike[str]) -> list[FrameScore]:
     """
     scores: list[FrameScore] = []
     with reading(path):
-        rows = csv.reader(input_lines(path))
+        rows = csv.reader(input_lines(Path(path)))
         if next(rows, None) != COLUMNS:
             raise InputError(f"{path}:1: the columns must be {','.join(COLUMNS)}")
         try:

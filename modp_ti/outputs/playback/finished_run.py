@@ -5,12 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fields.frames.origin import shifted_poses
 from fields.geometry.camera import PinholeCamera
+from modp_ti.config.keys import differing_keys
+from modp_ti.config.scene_file import load_scene
+from modp_ti.config.settings import SceneConfig
+from modp_ti.files import read_json
 from modp_ti.files.errors import InputError
 from modp_ti.files.reading import reading
 from modp_ti.files.run_folder import require_whole
@@ -22,6 +27,9 @@ from modp_ti.outputs.formats.splats_ply import read_splats
 from modp_ti.outputs.formats.trajectory import read_trajectory
 from modp_ti.outputs.playback.camera_paths import looking_at
 
+METRICS, SETTINGS = "metrics.json", "config.yaml"
+# Settings on which neither the map nor the other output files depend, but for the device, in the last digits.
+FREE = ("output", "device", "threads", "snapshot_every", "snapshot_store", "source.prefetch", "view")
 NEEDED = ("config.yaml", "splats.ply", "trajectory.txt", "colmap", "frames.json")
 
 # Of a file of splats: the quantile of the distances from the centre that counts as the map's radius, and from where the
@@ -152,3 +160,29 @@ def _pinhole(camera: ModelCamera, what: str) -> PinholeCamera:
         raise InputError(f"{what}: a {camera.model} camera is none of a run")
     fx, fy, cx, cy = camera.params
     return require_plausible(PinholeCamera(fx, fy, cx, cy, camera.width, camera.height), NO_DISTORTION, what)[0]
+
+
+def finished_metrics(config: SceneConfig) -> dict[str, Any] | None:
+    """Return the metrics of a finished run with these settings in `config.output`, None if there is none.
+
+    A run with further maps (`tracker.maps: all`) is finished when all of them are.
+    """
+    try:
+        require_whole(config.output)
+        metrics = read_json(config.output / METRICS, METRICS)
+        written = load_scene(config.output / SETTINGS)
+        further = int(metrics.get("further_maps", 0))
+    except (InputError, AttributeError, TypeError, ValueError):
+        return None
+    if not made_with(written, config):
+        return None
+    maps = [config.of_map(place).output / METRICS for place in range(2, 2 + further)]
+    return metrics if all(file.is_file() for file in maps) else None
+
+
+def made_with(written: SceneConfig, config: SceneConfig) -> bool:
+    """Whether the settings that a run has written are these, as far as its map depends on them."""
+    scale = written.source.scale
+    if scale != "auto":  # the run's number, which `auto` in the scene file became
+        config = config.resolved(scale)
+    return not differing_keys(written.model_dump(mode="json"), config.model_dump(mode="json"), FREE)

@@ -11,8 +11,8 @@ import pytest
 
 from modp_ti.config.scene_file import load_scene
 from modp_ti.engine.session import run_scene
-from modp_ti.many.task import finished_metrics
 from modp_ti.outputs.formats.trajectory import read_trajectory
+from modp_ti.outputs.playback.finished_run import finished_metrics
 from tests.modp_ti.inputs.klt.conftest import BoxRoom, Walk, box_room, walk  # noqa: F401 (a fixture)
 
 pytestmark = pytest.mark.slow

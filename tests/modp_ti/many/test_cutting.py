@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from fields.geometry.camera import PinholeCamera
+from modp_ti.engine.parts import MARGIN, SEES_TOO, SLACK, cut
 from modp_ti.files.errors import InputError
-from modp_ti.many.parts import MARGIN, SEES_TOO, SLACK, cut
 from pipelines.select.keyframes import SeenPoints, covisibility
 
 CAMERA = PinholeCamera(60.0, 60.0, 40.0, 30.0, 80, 60)

@@ -10,7 +10,7 @@ from modp_ti.config.scene_file import dump_scene, load_scene
 from modp_ti.config.settings import SceneConfig
 from modp_ti.many.batch import SNAPSHOT_EVERY, read_scenes, with_resources, with_store
 from modp_ti.many.pool import Resources
-from modp_ti.many.task import finished_metrics
+from modp_ti.outputs.playback.finished_run import finished_metrics
 
 SCENE = "source: {path: images}\ntracker: {kind: colmap}\noutput: OUT\n"
 
