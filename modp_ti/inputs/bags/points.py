@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,9 +29,6 @@ from modp_ti.inputs.point_cloud import projected_points
 from modp_ti.inputs.protocol import Progress
 from modp_ti.inputs.replay import PosedImage
 from modp_ti.inputs.sources.undistortion import Intrinsics
-
-if TYPE_CHECKING:
-    from modp_ti.inputs.readers.bag import BagSettings
 
 MOST_CLOUD_POINTS = 500_000
 # A depth image belongs to an image that was taken at most so long before or after it [s].
@@ -150,7 +147,8 @@ def with_depth_points(
     T_world_sensor: NDArray[np.float64],
     frames: Sequence[PosedImage],
     times: NDArray[np.float64],
-    tracker: BagSettings,
+    most: int,
+    farthest: float,
     progress: Progress | None = None,
 ) -> tuple[list[PosedImage], str]:
     """Give each frame points of the depth image that was taken nearest to it in time.
@@ -161,7 +159,8 @@ def with_depth_points(
         T_world_sensor: Pose (N, 4, 4) of the sensor at the times of the depth images, NaN where it is not known.
         frames: The frames.
         times: Their times (M,) [s].
-        tracker: How many points a frame gets, and how far away.
+        most: Largest number of points of a frame.
+        farthest: Largest depth of a point [m].
         progress: Called with what is done, how much of it and of how much.
 
     Returns:
@@ -183,7 +182,7 @@ def with_depth_points(
             damaged.append(f"{bag.path}: unreadable image of {topic.name}: {error}")
             continue
         depth = DepthMap(metres, metres > 0)
-        in_sensor, _ = sampled_points(depth, undistorter, index, min(tracker.max_points, MOST), tracker.max_depth)
+        in_sensor, _ = sampled_points(depth, undistorter, index, min(most, MOST), farthest)
         xyz = in_sensor @ T[:3, :3].T + T[:3, 3]
         ids = index * IDS_PER_FRAME + np.arange(len(xyz), dtype=np.int64)
         result[index] = frame.with_points(projected_points(xyz, ids, frame.undistorter, frame.T_camera_world))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from importlib.util import find_spec
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,6 @@ from modp_ti.inputs.klt.odometry import Odometry
 from modp_ti.inputs.klt.tracker import KltTracker, available, followed, grey_image, require_size
 from modp_ti.inputs.opening import open_source, require_pinhole
 from modp_ti.inputs.protocol import Progress
-from modp_ti.inputs.readers.klt import KltSettings
 from modp_ti.inputs.replay import readable_sizes
 from modp_ti.inputs.sources import FrameReader, ImageSource, Intrinsics, require_intrinsics
 from modp_ti.inputs.sources.image_header import focal_length_35mm
@@ -31,9 +30,19 @@ DIAGONAL_35MM = 43.27  # mm
 ENOUGH = 60
 
 
+class KltChoices(Protocol):
+    """What `KltSettings` says of loops and maps."""
+
+    loops: bool
+    maps: Any
+
+    @property
+    def place(self) -> int | None: ...
+
+
 def open_klt(
     source: SourceSettings,
-    settings: KltSettings | None = None,
+    settings: KltChoices | None = None,
     seed: int = 0,
     progress: Progress | None = None,
     images: ImageSource | None = None,
@@ -55,8 +64,7 @@ def open_klt(
         InputError: If the images are missing, unreadable or of several sizes, or do not fit the intrinsics; or if loops
             are to be closed without `gtsam`.
     """
-    settings = settings or KltSettings()
-    loops = settings.loops
+    loops = settings is not None and settings.loops
     if loops and find_spec("gtsam") is None:
         raise InputError(
             "tracker.loops needs gtsam (Linux and macOS, Python 3.11 or newer): pip install 'modp-ti[loops]'"
@@ -93,8 +101,8 @@ def open_klt(
         seed,
         notes,
         loops=loops,
-        place=settings.place,
-        further=settings.maps == "all",
+        place=None if settings is None else settings.place,
+        further=settings is not None and settings.maps == "all",
         progress=progress,
     )
 

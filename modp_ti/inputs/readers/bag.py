@@ -193,8 +193,9 @@ def _add_depths(
             raise InputError(
                 f"{images.path}: no transform leads from {topic.frame!r}, the frame of {topic.name}, to {world!r}"
             )
+        limits = tracker.max_points, tracker.max_depth
         recording.frames, note = with_depth_points(
-            images.bag, topic, T_world_sensor, recording.frames, times, tracker, recording.progress
+            images.bag, topic, T_world_sensor, recording.frames, times, *limits, recording.progress
         )
     except InputError as error:
         if tracker.depth is not None:

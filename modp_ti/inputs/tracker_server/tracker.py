@@ -11,7 +11,7 @@ from queue import Empty, Full, Queue
 from socket import SHUT_WR, create_connection, socket
 from threading import Event as Flag
 from threading import Thread
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, Protocol
 
 import numpy as np
 
@@ -45,7 +45,6 @@ from modp_ti.inputs.tracker_server.ordering import Ordering
 from modp_ti.inputs.tracker_server.spool import Spool, SpoolFullError, is_stream
 
 if TYPE_CHECKING:
-    from modp_ti.inputs.readers.socket import SocketSettings
     from modp_ti.inputs.source_settings import SourceSettings
 
 # What the server has received, in order; None at its end. Images and points of frames are in the spool.
@@ -60,9 +59,15 @@ MAX_WAITING = 1000
 FEW_UNFIT, UNFIT_SHARE = 3, 0.1
 
 
-def open_tracker_server(
-    source: SourceSettings, tracker: SocketSettings, progress: Progress | None = None
-) -> TrackerServer:
+class Listening(Protocol):
+    """What `SocketSettings` says of where to listen, and for how long."""
+
+    address: str | None
+    path: Path | None
+    patience: float
+
+
+def open_tracker_server(source: SourceSettings, tracker: Listening, progress: Progress | None = None) -> TrackerServer:
     """Start a server at the configured address.
 
     Args:
@@ -105,7 +110,7 @@ class TrackerServer(Tracker):
     reads_ahead: ClassVar[bool] = True
     corrects: ClassVar[bool] = True
 
-    def __init__(self, source: SourceSettings, tracker: SocketSettings, progress: Progress | None = None) -> None:
+    def __init__(self, source: SourceSettings, tracker: Listening, progress: Progress | None = None) -> None:
         self._source = source
         self._patience = tracker.patience
         self._again = tracker.path if is_stream(tracker.path) else None

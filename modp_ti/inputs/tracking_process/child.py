@@ -20,7 +20,6 @@ from modp_ti.files.processes import left_to_parent
 from modp_ti.files.terminal import own_terminal
 from modp_ti.inputs.klt import KltTracker, open_klt
 from modp_ti.inputs.opening import open_source
-from modp_ti.inputs.readers.klt import KltSettings
 from modp_ti.inputs.sources import FrameReader, ImageSource, Picture, Undistorter
 from modp_ti.inputs.tracking_process.exchange import (
     CameraRevised,
@@ -83,9 +82,8 @@ class _Child:
         sender = None
         try:
             self._images = open_source(source, self._job.folder)
-            settings = self._job.config.tracker
-            assert isinstance(settings, KltSettings)  # the one tracker that follows streams
-            self._tracker = tracker = open_klt(source, settings, self._job.config.seed, self._prepare, self._images)
+            scene = self._job.config  # its tracker is `klt`, the one that follows streams
+            self._tracker = tracker = open_klt(source, scene.tracker, scene.seed, self._prepare, self._images)
             self._publish()
             self._connection.send(Opened(tracker.notes, tracker.scale, tracker.intrinsics))
             sender = threading.Thread(target=self._send, args=(tracker.undistorter,), name="sender", daemon=True)
