@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from tests.fault_injection.recordings import write_recording
 from tests.modp_ti.engine.stopped_runs import resumed_run
@@ -129,7 +130,9 @@ def test_the_frames_of_another_tracker_survive_a_killed_run(recording: Path, tmp
     options = ["--to", str(tmp_path / "server"), "--late", "1", "--wait", "300", "--rate", "1"]
     sender = subprocess.Popen([*script, *options], cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     wait_for((tmp_path / "out" / "recording.yaml").exists)
-    wait_for(lambda: sum(file.stat().st_size for file in (tmp_path / "temporary").glob("*/stream.modp")) > 6 * 4000)
+    with Image.open(next((recording / "images").iterdir())) as image:
+        enough = 8 * (4 * image.width * image.height + 20_000)  # pixels, and some 400 points with the pose
+    wait_for(lambda: sum(file.stat().st_size for file in (tmp_path / "temporary").glob("*/stream.modp")) > enough)
     assert run.end(signal.SIGKILL) == -signal.SIGKILL
     sender.kill()
     sender.wait()
