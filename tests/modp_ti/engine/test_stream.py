@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -97,7 +98,7 @@ def test_the_thread_ends_with_the_block_whatever_happens_in_it(frames_taken: int
 
 
 @pytest.mark.slow
-def test_a_run_gives_the_same_map_and_the_same_error_with_and_without(plane_scene) -> None:
+def test_a_run_gives_the_same_map_and_the_same_error_with_and_without(plane_scene, tmp_path: Path) -> None:
     x, y = np.meshgrid(np.linspace(-1.2, 1.2, 9), np.linspace(-0.9, 0.9, 7))
     plane_scene.write_colmap(np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1))
     scene = plane_scene.folder.parent / "scene.yaml"
@@ -105,7 +106,7 @@ def test_a_run_gives_the_same_map_and_the_same_error_with_and_without(plane_scen
         "source: {path: images, holdout: 4, scale: 0.25}\ntracker: {kind: colmap, path: sparse/0}\noutput: out\n"
         "device: cpu\nmapping: {optimise: {steps: 2}, densify: {pixels: 200}}\nrefine: {steps: 2}\n"
     )
-    outputs = [run_scene(load_scene(scene, [f"source.prefetch={n}", f"output=out{n}"])) for n in (0, 3)]
+    outputs = [run_scene(load_scene(scene, [f"source.prefetch={n}", f"output={tmp_path / str(n)}"])) for n in (0, 3)]
     for name in ("splats.ply", "trajectory.txt", "scores.csv"):
         first, second = ((output / name).read_bytes() for output in outputs)
         assert first == second, name
@@ -117,7 +118,7 @@ def test_a_run_gives_the_same_map_and_the_same_error_with_and_without(plane_scen
     errors = []
     for prefetch in (0, 3):
         with pytest.raises(UnreadableImageError, match=r"view11\.png") as error:
-            run_scene(load_scene(scene, [f"source.prefetch={prefetch}", "output=bad"]))
+            run_scene(load_scene(scene, [f"source.prefetch={prefetch}", f"output={tmp_path / 'bad'}"]))
         errors.append(str(error.value))
     assert errors[0] == errors[1]
 
