@@ -1,4 +1,4 @@
-"""TODO."""
+"""The pool of Gaussians: appending, removing, growing without a new compilation, and saving and loading."""
 
 from __future__ import annotations
 
