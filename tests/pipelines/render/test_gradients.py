@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from fields.geometry.se3 import exp_se3
 from fields.runtime.engine import ti
-from pipelines.render.compositing_reference import ReferenceCompositing
 from pipelines.render.renderer import Renderer
+from tests.pipelines.compositing_reference import ReferenceCompositing
 from tests.pipelines.differences import STEP, central_differences
 from tests.pipelines.scenes import CAMERA, NEAR, POSE, random_gaussians
 

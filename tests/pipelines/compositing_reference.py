@@ -1,9 +1,8 @@
 """Reference implementation of compositing: one task per pixel, over the Gaussians of its tile.
 
-It follows the equations of `compositing.py` directly. It is much slower on a CPU, since each pixel's loop is scalar.
-The tests compare the two implementations, and `scripts/benchmark` prints the ratio of their times.
+It follows the equations of `pipelines/render/cpu/compositing.py` directly. It is much slower on a CPU, since each
+pixel's loop is scalar.
 """
-# pyright: reportArgumentType=false, reportIndexIssue=false, reportInvalidTypeForm=false, reportOptionalSubscript=false
 
 from fields.buffers.images import PAD
 from fields.buffers.tiles import TILE_HEIGHT, TILE_WIDTH
