@@ -122,7 +122,7 @@ def _refined(run: FinishedRun, config: SceneConfig, metrics: dict[str, Any], lin
         scores = _score(run, config, mapper, version, results, line)
         metrics = {
             **metrics,
-            STAGE: summary_of(scores, STAGE, version),
+            STAGE: summary_of(scores, STAGE, version, {view.index for view in mapper.keyframes}),
             "gaussians": len(version.gaussians["position"]),
             "refinement": {"before": earlier, "steps": config.refine.steps, "seconds": seconds},
         }

@@ -160,13 +160,18 @@ class Results:
 
 
 def metrics_of(
-    scores: list[FrameScore], versions: dict[str, MapVersion], frames: DeliveredFrames, seconds: dict[str, float]
+    scores: list[FrameScore],
+    versions: dict[str, MapVersion],
+    fitted: Collection[int],
+    frames: DeliveredFrames,
+    seconds: dict[str, float],
 ) -> dict:
     """Return the entries of `metrics.json` about the engine, the maps, the reprojection errors and the time.
 
     Args:
         scores: Scores of all frames in all versions.
         versions: Map versions by name; the last one is the final map.
+        fitted: Indices of the frames that the map was optimised on.
         frames: All frames, with their tracked points.
         seconds: Time of each stage and `total` [s].
     """
@@ -181,18 +186,21 @@ def metrics_of(
         "engine": str(engine()),
         "frames": len(frames),
         "corrections": frames.corrections,
-        **{stage: summary_of(scores, stage, versions[stage]) if stage in versions else None for stage in MAPS},
+        **{stage: summary_of(scores, stage, versions[stage], fitted) if stage in versions else None for stage in MAPS},
         **{f"reprojection_error{name}": None if error is None else round(error, 4) for name, error in errors.items()},
         "seconds": {name: round(time, 3) for name, time in taken.items()},
     }
 
 
-def summary_of(scores: list[FrameScore], stage: str, version: MapVersion) -> dict[str, dict | int]:
-    """Mean scores of one version over all frames and over the held-out ones, with its size and cost."""
+def summary_of(
+    scores: list[FrameScore], stage: str, version: MapVersion, fitted: Collection[int]
+) -> dict[str, dict | int]:
+    """Mean scores of one version over all frames, the held-out and the fitted ones, with its size and cost."""
     of = [score for score in scores if score.stage == stage]
     return {
         "all": summary(of),
         "held_out": summary([score for score in of if score.held_out]),
+        "fitted": summary([score for score in of if score.index in fitted]),
         "gaussians": len(version.gaussians["position"]),
         "view_renders": version.view_renders,
     }

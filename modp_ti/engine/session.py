@@ -146,6 +146,7 @@ def _write_figures(finished: FinishedMap, results: Results, scores: list[FrameSc
     if run.truth is not None:
         truth, note = true_poses(run.truth, frames.timestamp, tracker.before)
         run.say(*([note] if note else []))
+    fitted = {view.index for view in pipeline.keyframes}
     caught = pipeline.caught()
     if warning := caught.warning():
         run.say(warning)
@@ -164,7 +165,7 @@ def _write_figures(finished: FinishedMap, results: Results, scores: list[FrameSc
         "lpips_note": stream.no_lpips,
         "breakdown_percent": finished.breakdown,
         "further_maps": tracker.further_maps,
-        **metrics_of(scores, versions, frames, pipeline.stopwatch.seconds | {"total": run.clock.total}),
+        **metrics_of(scores, versions, fitted, frames, pipeline.stopwatch.seconds | {"total": run.clock.total}),
         "retention": retention(run.record.frames, scores),
         **run.conductor.metrics(),
         **trajectory_errors(frames.T_tracked, finished.last.trajectory, truth),

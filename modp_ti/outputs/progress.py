@@ -351,11 +351,13 @@ class ProgressLine:
         scores = metrics["refined"] or metrics["online"] or metrics["offline"]
         which = "held_out" if scores["held_out"]["count"] else "all"
         psnr, ssim, lpips = (scores[which][name] for name in ("psnr", "ssim", "lpips"))
+        fitted = scores["fitted"]["psnr"]
         self.note(
             f"{metrics['frames']} frames, {metrics['keyframes']} keyframes, {metrics['gaussians']:,} Gaussians, "
             f"{metrics['frames_per_second']:.2f} frames/s"
             + ("" if psnr is None else f"; {which.replace('_', '-')} PSNR {psnr:.2f} dB, SSIM {ssim:.3f}")
             + ("" if lpips is None else f", LPIPS {lpips:.3f}")
+            + ("" if fitted is None else f"; fitted PSNR {fitted:.2f} dB")
         )
 
     def _update(self, **changes: Any) -> None:

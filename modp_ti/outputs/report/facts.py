@@ -123,11 +123,21 @@ def headline(metrics: Mapping[str, Any]) -> dict[str, str]:
     scores = metrics[last_stage(metrics)]
     of, means = ("held-out", scores["held_out"]) if scores["held_out"]["count"] else ("all frames", scores["all"])
     figures = {f"PSNR, {of}": f"{shown(means['psnr'], '.2f')} dB", f"SSIM, {of}": shown(means["ssim"], ".3f")}
+    if (fitted := scores.get("fitted", {}).get("psnr")) is not None:
+        figures["PSNR, fitted"] = f"{shown(fitted, '.2f')} dB"
     if means["lpips"] is not None:
         figures[f"LPIPS, {of}"] = shown(means["lpips"], ".3f")
     counts = {"Gaussians": "gaussians", "frames": "frames", "keyframes": "keyframes"}
     figures |= {label: f"{metrics[name]:,}" for label, name in counts.items()}
     return figures | {"time": duration(metrics["seconds"]["total"])}
+
+
+def side_by_side(metrics: Mapping[str, Any]) -> dict[str, str]:
+    """Return what the table of scores compares: headings by key in metrics.json. Older runs have no fitted frames."""
+    names = {"held_out": "held-out frames", "fitted": "fitted frames", "all": "all frames"}
+    scores = metrics[last_stage(metrics)]
+    shown = [name for name in names if scores.get(name, {"count": 0})["count"]]
+    return {name: names[name] for name in shown[:2]}
 
 
 def other_figures(metrics: Mapping[str, Any]) -> dict[str, str]:

@@ -17,7 +17,7 @@ from fields.geometry.se3 import camera_centres
 from modp_ti.config.settings import SceneConfig
 from modp_ti.files.atomic import replace_text
 from modp_ti.files.errors import InputError
-from modp_ti.outputs.evaluation import FrameScore, MapVersion, umeyama
+from modp_ti.outputs.evaluation import FrameScore, MapVersion, summary, umeyama
 from modp_ti.outputs.playback.map_renderer import eight_bits
 from modp_ti.outputs.report import facts, plots
 from modp_ti.outputs.report.record import RunRecord
@@ -196,6 +196,8 @@ def write_report(path: Path, run: ReportedRun) -> None:
         started=time.strftime("%d %B %Y, %H:%M", time.localtime(run.record.started)),
         stage=facts.last_stage(run.metrics),
         maps=[stage for stage in ("online", "refined", "offline") if run.metrics[stage] is not None],
+        compared=facts.side_by_side(run.metrics),
+        no_scores=summary([]),
         remarks=facts.remarks(run.metrics, run.record.notes),
         drawings={name: _uri("svg+xml", svg.encode("utf-8")) for name, svg in _drawings(run).items()},
         scale=_uri("png", cv2.imencode(".png", np.ascontiguousarray(strip))[1].tobytes()),

@@ -53,6 +53,7 @@ def test_the_metrics_say_what_happened(folder: Path) -> None:
     assert metrics["online"] is metrics["refined"] is None
     assert metrics["offline"]["all"]["count"] == 9
     assert metrics["offline"]["held_out"]["count"] == 3
+    assert metrics["offline"]["fitted"]["count"] == 6, "every frame that is not held out"
     assert metrics["offline"]["all"]["psnr"] > 12
     assert metrics["seconds"]["optimise"] > 0
     assert metrics["seconds"]["refine"] == metrics["seconds"]["depth"] == 0

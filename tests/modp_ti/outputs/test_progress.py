@@ -107,11 +107,12 @@ def test_a_tracker_that_prepares_shows_it_in_place_of_what_is_gone_through() -> 
 
 
 @pytest.mark.parametrize(
-    ("count", "said"), [(2, "; held-out PSNR 25.00 dB, SSIM 0.900, LPIPS 0.100\n"), (0, ", 1.50 frames/s\n")]
+    ("count", "said"),
+    [(2, "; held-out PSNR 25.00 dB, SSIM 0.900, LPIPS 0.100; fitted PSNR 25.00 dB\n"), (0, ", 1.50 frames/s\n")],
 )
 def test_a_run_without_scores_ends_in_a_line_without_them(count: int, said: str) -> None:
     scores = dict(zip(("psnr", "ssim", "lpips"), (25.0, 0.9, 0.1) if count else (None, None, None), strict=True))
-    stage = {"held_out": scores | {"count": count}, "all": scores | {"count": count}}
+    stage = dict.fromkeys(("held_out", "fitted", "all"), scores | {"count": count})
     metrics = {"frames": 3, "keyframes": 2, "gaussians": 1200, "frames_per_second": 1.5, "refined": None}
     console = Console(file=io.StringIO(), width=200)
     ProgressLine(console).summary(metrics | {"online": stage, "offline": None})

@@ -149,7 +149,7 @@ def made_up_run(
         "ate_rmse": 0.0123 if truth else None,
         "ate_rmse_rigid": 0.0234 if truth else None,
         "ate_rmse_tracked": 0.0345 if truth else None,
-        **metrics_of(scores, versions, delivered(tracked, held_out), seconds),
+        **metrics_of(scores, versions, keyframes, delivered(tracked, held_out), seconds),
         "retention": retention(record.frames, scores),
     }
     album = Album.of(held_out)

@@ -67,7 +67,7 @@ def test_the_numbers_are_those_of_the_metrics(made) -> None:
     for stage in ("online", "refined"):
         m = run.metrics[stage]
         expected = []
-        for which in ("held_out", "all"):
+        for which in ("held_out", "fitted"):
             s = m[which]
             expected += [f"{s['psnr']:.2f}", f"{s['ssim']:.3f}", "–", f"{s['detail']:.2f}", str(s["count"])]
         assert rows[stage] == [*expected, f"{m['gaussians']:,}", f"{m['view_renders']:,}"]
@@ -76,13 +76,30 @@ def test_the_numbers_are_those_of_the_metrics(made) -> None:
     assert {"0.0123", "0.0345", "1,234 MB"} <= set(figures)
     assert any(f"{kept['mean']:+.2f} dB" in cell and f"{kept['worst']:+.2f} dB" in cell for cell in figures)
     headline = " ".join(page.text)
-    assert f"{run.metrics['refined']['held_out']['psnr']:.2f} dB" in headline
+    for which in ("held_out", "fitted"):
+        assert f"{run.metrics['refined'][which]['psnr']:.2f} dB" in headline
     assert f"{run.metrics['gaussians']:,}" in headline
     rows, seconds = {row[0]: row[1:] for row in page.tables["time"]}, run.metrics["seconds"]
     assert {name for name in rows if name != "total"} == {k for k, v in seconds.items() if v > 0 and k != "total"}
     assert all(row[1] == f"{seconds[name]:.1f} s" for name, row in rows.items())
     widths = [float(w) for w in re.findall(r'<i style="width: ([0-9.]+)%">', html)]
     assert sum(widths) == pytest.approx(100, abs=0.1), "bars as long as the stages"
+
+
+def test_a_version_that_knows_no_fitted_frames_has_its_row_beside_one_that_does(tmp_path) -> None:
+    run = made_up_run(tmp_path, frames=9)
+    online = {name: value for name, value in run.metrics["online"].items() if name != "fitted"}
+    page, _ = written(tmp_path, dataclasses.replace(run, metrics={**run.metrics, "online": online}))
+    rows = {row[0]: row[1:] for row in page.tables["numbers"] if row}
+    assert rows["online"][0] == f"{online['held_out']['psnr']:.2f}" and rows["online"][5] == "–"
+    assert rows["refined"][5] == f"{run.metrics['refined']['fitted']['psnr']:.2f}"
+
+
+def test_without_held_out_frames_the_fitted_ones_are_beside_all(tmp_path) -> None:
+    run = made_up_run(tmp_path, frames=9, holdout=0)
+    page, _ = written(tmp_path, run)
+    rows = {row[0]: row[1:] for row in page.tables["numbers"] if row}
+    assert [rows["refined"][i] for i in (4, 9)] == [str(len(run.keyframes)), "9"]
 
 
 def test_the_curves_are_the_recorded_numbers(made) -> None:
