@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 
 from fields.frames.tracked_frame import TrackedFrame
@@ -31,8 +30,10 @@ from modp_ti.outputs.playback.finished_run import FinishedRun, open_run
 from modp_ti.outputs.playback.run_frames import frames_of, kept_images, run_settings
 from modp_ti.outputs.progress import ProgressLine
 from modp_ti.outputs.report.record import RunRecord
+from modp_ti.outputs.report.where_wrong import Motion
 from pipelines.online import OnlineMapper
 from pipelines.refinement import refine
+from pipelines.render.renderer import RenderedView
 from pipelines.whole.finished_map import go_on
 
 # Steps of a refinement, if the run's settings ask for none.
@@ -177,8 +178,8 @@ def _score(
         return []
     lpips, _ = open_lpips(config.evaluation.lpips_weights, min(run.size))
 
-    def keep(_: str, frame: TrackedFrame, render: NDArray[np.float32]) -> None:
-        results.write_frame(frame, render)
+    def keep(_: str, frame: TrackedFrame, render: RenderedView) -> None:
+        results.write_frame(frame, render, Motion.at(version.trajectory, run.record.keyframes, frame))
 
     def frames() -> Iterator[TrackedFrame]:
         yield from frames_of(run, range(len(run)), line.prepare)

@@ -29,9 +29,11 @@ from modp_ti.outputs.formats.run_files import NOT_ALWAYS, write_map, write_score
 from modp_ti.outputs.formats.splats_ply import check_splats
 from modp_ti.outputs.report.page import Album, ReportedRun, write_report
 from modp_ti.outputs.report.record import RunRecord
+from modp_ti.outputs.report.where_wrong import ErrorSurvey, Motion, Needles
 from pipelines.companions.pace import CompletePace
 from pipelines.online import OnlineMapper
 from pipelines.pipeline import Pipeline
+from pipelines.render.renderer import RenderedView
 
 STAGES = ("compile", "read", "track", "select", "depth", "occupancy", "optimise", "refine", "evaluate")
 # Map versions with a key in metrics.json; the value is null if the run did not make that version.
@@ -57,6 +59,7 @@ class Results:
         self.undistorter = undistorter
         self._names = image_names(frames.name, config.export.images)
         self._album = Album.of(frames.held_out)
+        self._survey = ErrorSurvey(held_out=any(frames.held_out))
 
     @contextmanager
     def writing_map(self) -> Iterator[None]:
@@ -105,19 +108,26 @@ class Results:
         store, near = pipeline.keyframes, pipeline.near
         write_map(folder, version, self.frames, self._names, store, near, self.undistorter)
 
-    def write_frame(self, frame: TrackedFrame, render: NDArray[np.float32]) -> None:
-        """Write the pictures of a frame, given its render (H, W, 3), and keep those that the report may show.
+    def write_frame(self, frame: TrackedFrame, render: RenderedView, motion: Motion | None) -> None:
+        """Write the pictures of a frame, and keep what the report may show of it.
 
         The image is written if `export.images` is set. A held-out frame also gets a picture of image and render side by
         side.
+
+        Args:
+            frame: The frame.
+            render: Its render, developed and clipped.
+            motion: The camera's motion there, None if there is none.
         """
         if self.config.export.images:
             write_image(self.folder / "colmap", self._names[frame.index], frame)
         if frame.held_out:
-            pair = np.round(np.hstack([frame.image, render]) * 255.0).astype(np.uint8)
+            pair = np.round(np.hstack([frame.image, render.colour]) * 255.0).astype(np.uint8)
             write_picture(self.folder / "renders" / f"{frame.index:06d}.png", pair)
         if self.config.export.report:
-            self._album.keep(frame.index, frame.image, render)
+            self._album.keep(frame.index, frame.image, render.colour)
+            if motion is not None and frame.held_out == self._survey.held_out:
+                self._survey.add(frame, render, motion)
 
     def write_scores(self, scores: list[FrameScore], metrics: dict) -> None:
         """Write `scores.csv` and `metrics.json`."""
@@ -140,7 +150,9 @@ class Results:
             None, or one line that says why there is no report.
         """
         try:
-            last = [score for score in scores if score.stage == list(versions)[-1]]
+            stage, version = list(versions.items())[-1]
+            places = [place for place, index in enumerate(self.frames.index) if index in keyframes]
+            views = [(self.frames.camera[place], version.trajectory[place]) for place in places]
             run = ReportedRun(
                 config=self.config,
                 record=record,
@@ -149,9 +161,13 @@ class Results:
                 versions=versions,
                 tracked=self.frames.T_tracked,
                 truth=truth,
-                keyframes=[place for place, index in enumerate(self.frames.index) if index in keyframes],
+                keyframes=places,
                 scene_depth=scene_depth,
-                comparisons=self._album.comparisons(last, self.folder / "renders"),
+                comparisons=self._album.comparisons(
+                    [score for score in scores if score.stage == stage], self.folder / "renders"
+                ),
+                survey=self._survey,
+                needles=Needles.of(version.gaussians, views),
             )
             write_report(self.folder / "report.html", run)
         except Exception as error:  # the map is finished; no error of the report may lose it

@@ -26,6 +26,8 @@ from modp_ti.inputs.timed_poses import true_poses
 from modp_ti.outputs.evaluation import FrameScore, evaluate, trajectory_errors
 from modp_ti.outputs.progress import ProgressLine, StageProgress
 from modp_ti.outputs.report.record import retention
+from modp_ti.outputs.report.where_wrong import Motion
+from pipelines.render.renderer import RenderedView
 
 
 def run_scene(
@@ -115,13 +117,15 @@ def _score(finished: FinishedMap, results: Results) -> list[FrameScore]:
     if not run.config.evaluation.scores:
         return []
 
-    def keep(stage: str, frame: TrackedFrame, render: NDArray[np.float32]) -> None:
+    pipeline, frames = stream.pipeline, stream.mapper.frames
+    keyframes = [keyframe.index for keyframe in pipeline.keyframes.selected]
+
+    def keep(stage: str, frame: TrackedFrame, render: RenderedView) -> None:
         run.stop.check()
         run.line.advance()
         if stage == list(versions)[-1]:
-            results.write_frame(frame, render)
+            results.write_frame(frame, render, Motion.at(finished.last.trajectory, keyframes, frame))
 
-    pipeline, frames = stream.pipeline, stream.mapper.frames
     run.line.start("evaluating the saved map", len(frames) * len(versions))
     try:
         with pipeline.stopwatch.measure("evaluate"), FramesAhead(frames.again(run.tracker), run.ahead) as again:

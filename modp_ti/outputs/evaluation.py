@@ -50,21 +50,29 @@ def explained_detail(
     Returns:
         The share, None if the image has no detail.
     """
-    weight = valid.astype(np.float32)[..., None]
-    around = np.maximum(_blurred(weight), 1e-6)
-
-    def finest(picture: NDArray[np.floating]) -> NDArray[np.float32]:
-        counted = (np.asarray(picture, dtype=np.float32) * weight).astype(np.float32)
-        return np.asarray(counted - weight * _blurred(counted) / around, dtype=np.float32)
-
-    detail = finest(image)
+    detail = finest_band(image, valid)
     whole = float(np.square(detail, dtype=np.float64).sum())
-    return None if whole == 0.0 else 1.0 - float(np.square(detail - finest(render), dtype=np.float64).sum()) / whole
+    lost = float(np.square(detail - finest_band(render, valid), dtype=np.float64).sum())
+    return None if whole == 0.0 else 1.0 - lost / whole
+
+
+def finest_band(picture: NDArray[np.floating], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Return a picture (H, W, 3) minus itself blurred, see `explained_detail`; 0 where it is not valid (H, W)."""
+    picture = np.asarray(picture, dtype=np.float32)
+    if valid.all():
+        return picture - _blurred(picture)
+    counted = picture.copy()
+    counted[~valid] = 0.0
+    weight = valid.astype(np.float32)
+    share = weight / np.maximum(_blurred(weight), np.float32(1e-6))
+    blurred = _blurred(counted)
+    blurred *= cv2.merge([share] * 3)
+    counted -= blurred
+    return counted
 
 
 def _blurred(picture: NDArray[np.float32]) -> NDArray[np.float32]:
-    blurred = np.asarray(cv2.GaussianBlur(picture, (0, 0), SIGMA, borderType=cv2.BORDER_REFLECT_101), dtype=np.float32)
-    return blurred.reshape(picture.shape)
+    return np.asarray(cv2.GaussianBlur(picture, (0, 0), SIGMA, borderType=cv2.BORDER_REFLECT_101), dtype=np.float32)
 
 
 @dataclass(frozen=True)
@@ -123,15 +131,14 @@ class StillScorer:
             coarse = compared(pipeline.renderer, view, T, exposure, pipeline.near)
             self._coarse.append(without(coarse, view.transient))
 
-    def score(self, frame: TrackedFrame, colour: NDArray[np.float32]) -> StillScore:
+    def score(self, frame: TrackedFrame, render: RenderedView) -> StillScore:
         """Score the frame that was rendered last.
 
         Args:
-            frame: The frame. The renderer's images hold its render, with the colour developed and clipped.
-            colour: The colour (H, W, 3) of that render.
+            frame: The frame. The renderer's images hold its render.
+            render: The same render, with the colour developed and clipped.
         """
         images = self._pipeline.renderer.images
-        render = RenderedView(colour, images.depth_to_numpy(), images.opacity_to_numpy())
         coarse = coarse_view(render, frame.rgba, frame.camera, self._version.trajectory[frame.index])
         around = neighbours(place_of(self._views, frame.index), len(self._views))
         mask = soft_mask(*moving(coarse, [self._coarse[i] for i in around], kept=False))
@@ -198,7 +205,7 @@ def score_frame(
     stage: str,
     lpips: Lpips | None = None,
     exposure: NDArray[np.float64] | None = None,
-) -> tuple[FrameScore, NDArray[np.float32]]:
+) -> tuple[FrameScore, RenderedView]:
     """Render a frame's view in the current map and score it.
 
     The render is developed with the frame's exposure and vignette and clipped to [0, 1]. Masked pixels do not count,
@@ -213,14 +220,15 @@ def score_frame(
         exposure: (3, 4) affine colour transform of the frame, None for the identity.
 
     Returns:
-        The score, and the render (H, W, 3).
+        The score, and the render.
     """
     rgba = frame.rgba
     values = _compare(pipeline, frame, T_camera_world, exposure)
-    render = pipeline.renderer.images.colour_to_numpy()
+    images = pipeline.renderer.images
+    render = RenderedView(images.colour_to_numpy(), images.depth_to_numpy(), images.opacity_to_numpy())
     image = np.asarray(rgba[..., :3] / np.float32(255.0), dtype=np.float32)
-    distance = None if lpips is None else lpips(render, image)
-    detail = explained_detail(render, image, rgba[..., 3] > 0)
+    distance = None if lpips is None else lpips(render.colour, image)
+    detail = explained_detail(render.colour, image, rgba[..., 3] > 0)
     score = FrameScore(frame.index, frame.name, frame.held_out, stage, values.psnr, values.ssim, distance, detail)
     return score, render
 
@@ -250,7 +258,7 @@ def evaluate(
     frames: Iterable[TrackedFrame],
     versions: Mapping[str, MapVersion],
     lpips: Lpips | None,
-    rendered: Callable[[str, TrackedFrame, NDArray[np.float32]], None],
+    rendered: Callable[[str, TrackedFrame, RenderedView], None],
 ) -> list[FrameScore]:
     """Score every frame in every version of the map.
 
@@ -259,7 +267,7 @@ def evaluate(
         frames: All frames.
         versions: Map versions by name.
         lpips: The LPIPS network, None to leave it out.
-        rendered: Called with the version's name, the frame and its render (H, W, 3).
+        rendered: Called with the version's name, the frame and its render, with the colour developed and clipped.
 
     Returns:
         The scores, ordered by version.

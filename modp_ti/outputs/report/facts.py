@@ -122,9 +122,10 @@ def headline(metrics: Mapping[str, Any]) -> dict[str, str]:
     """Return the main figures by label."""
     scores = metrics[last_stage(metrics)]
     of, means = ("held-out", scores["held_out"]) if scores["held_out"]["count"] else ("all frames", scores["all"])
-    figures = {f"PSNR, {of}": f"{shown(means['psnr'], '.2f')} dB", f"SSIM, {of}": shown(means["ssim"], ".3f")}
+    figures = {f"PSNR, {of}": f"{shown(means['psnr'], '.2f')} dB"}
     if (fitted := scores.get("fitted", {}).get("psnr")) is not None:
         figures["PSNR, fitted"] = f"{shown(fitted, '.2f')} dB"
+    figures[f"SSIM, {of}"] = shown(means["ssim"], ".3f")
     if means["lpips"] is not None:
         figures[f"LPIPS, {of}"] = shown(means["lpips"], ".3f")
     counts = {"Gaussians": "gaussians", "frames": "frames", "keyframes": "keyframes"}

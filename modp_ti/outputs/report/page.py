@@ -21,6 +21,7 @@ from modp_ti.outputs.evaluation import FrameScore, MapVersion, summary, umeyama
 from modp_ti.outputs.playback.map_renderer import eight_bits
 from modp_ti.outputs.report import facts, plots
 from modp_ti.outputs.report.record import RunRecord
+from modp_ti.outputs.report.where_wrong import ErrorSurvey, Needles
 
 # Error at which the colour scale ends.
 FULL_SCALE = 0.2
@@ -162,6 +163,8 @@ class ReportedRun:
         keyframes: Positions of the keyframes among the frames.
         scene_depth: The scene's depth [scene units].
         comparisons: Frames next to renders of the final map.
+        survey: Where the final map is wrong.
+        needles: The needles of the final map.
     """
 
     config: SceneConfig
@@ -174,6 +177,8 @@ class ReportedRun:
     keyframes: Sequence[int]
     scene_depth: float
     comparisons: Sequence[Comparison]
+    survey: ErrorSurvey
+    needles: Needles
 
 
 def write_report(path: Path, run: ReportedRun) -> None:
@@ -234,6 +239,7 @@ def _drawings(run: ReportedRun) -> dict[str, str]:
         "growth": bool(frames) and online and (plots.growth, frames),
         "pace": any(note.lag is not None for note in frames) and (plots.pace, frames),
         "steps": bool(run.record.steps) and (plots.steps, run.record.steps),
+        "place": bool(run.survey.by_depth()) and (plots.places, *run.survey.by_place(), run.survey.aspect),
         "trajectory": (plots.trajectory, plan, run.tracked, last.trajectory, run.keyframes, floor, truth),
         "poses": online and (plots.pose_changes, run.tracked, ways, run.scene_depth),
     }

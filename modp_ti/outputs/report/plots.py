@@ -210,6 +210,28 @@ def pose_changes(
     return panels(1.7, "frame", rows)
 
 
+def places(error: NDArray[np.float64], detail: NDArray[np.float64], aspect: float) -> Figure:
+    """Draw where in the picture the map is wrong.
+
+    Args:
+        error: Root mean square error (R, C) in [0, 1], of the cells of a grid over the picture.
+        detail: Explained detail (R, C), at most 1.
+        aspect: Width over height of the picture.
+    """
+    from matplotlib.figure import Figure
+
+    shown = (("root mean square error [% of black to white]", 100 * error, "inferno", None),)
+    shown = (*shown, ("detail", detail, "viridis", 1.0))
+    figure = Figure(figsize=(WIDTH, min(0.45 * WIDTH / aspect, WIDTH) + 0.3))
+    for axes, (title, values, colours, most) in zip(figure.subplots(1, 2), shown, strict=True):
+        drawn = axes.imshow(values, cmap=colours, vmin=0.0, vmax=most, extent=(0.0, aspect, 0.0, 1.0))
+        axes.set(xticks=[], yticks=[], title=title)
+        axes.spines[:].set_visible(False)
+        axes.title.set_fontsize(9)
+        figure.colorbar(drawn, ax=axes, shrink=0.9)
+    return figure
+
+
 def frame_rate(frames: Sequence[FrameNote], window: int) -> NDArray[np.float64]:
     """Return frames per second (N,) over the `window` frames that end at each frame.
 

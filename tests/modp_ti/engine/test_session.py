@@ -115,6 +115,7 @@ def test_the_report_shows_the_figures_and_the_pictures_of_the_run(finished: Path
         held_out, fitted = metrics[stage]["held_out"], metrics[stage]["fitted"]
         assert rows[stage][0] == f"{held_out['psnr']:.2f}" and rows[stage][5] == f"{fitted['psnr']:.2f}"
         assert rows[stage][3] == f"{held_out['detail']:.2f}" and rows[stage][8] == f"{fitted['detail']:.2f}"
+    assert any("3 held-out frames, refined map" in line for line in page.text)
     times = {row[0]: row[2] for row in page.tables["time"]}
     assert times["total"] == f"{metrics['seconds']['total']:.1f} s"
     assert any(line.startswith("LPIPS is not computed: ") for line in page.text), "what the run remarked"

@@ -23,7 +23,9 @@ from modp_ti.inputs.source_settings import SourceSettings
 from modp_ti.outputs.evaluation import FrameScore, MapVersion
 from modp_ti.outputs.report.page import Album, ReportedRun
 from modp_ti.outputs.report.record import RunRecord, StepNote, retention
+from modp_ti.outputs.report.where_wrong import ErrorSurvey, Motion, Needles
 from pipelines.pipeline import FrameReport
+from pipelines.render.renderer import RenderedView
 
 
 def cameras(count: int, radius: float = 1.0, height: float = 1.5) -> list[NDArray[np.float64]]:
@@ -58,6 +60,8 @@ def gaussians(count: int) -> dict[str, NDArray[np.float32]]:
         "position": rng.uniform(-2, 2, (count, 3)).astype(np.float32),
         "opacity_logit": rng.normal(1, 2, count).astype(np.float32),
         "sh": rng.normal(0, 0.5, (count, 1, 3)).astype(np.float32),
+        "log_scale": rng.normal(-4, 1, (count, 3)).astype(np.float32),
+        "quaternion": rng.normal(0, 1, (count, 4)).astype(np.float32),
     }
 
 
@@ -162,6 +166,13 @@ def made_up_run(
             pair = np.round(np.hstack([image, render])[..., ::-1] * 255).astype(np.uint8)
             cv2.imwrite(str(folder / "renders" / f"{i:06d}.png"), pair)
         album.keep(i, image, render)
+    survey = ErrorSurvey(any(held_out))
+    for i in range(frames):
+        frame = dataclasses.replace(black_frame(i), image=picture(i, (16, 16)))
+        motion = Motion.at(tracked, keyframes, frame)
+        if held_out[i] == survey.held_out and motion is not None:
+            flat = np.ones((16, 16), np.float32)
+            survey.add(frame, RenderedView(picture(i + 1000, (16, 16)), (1 + i) * flat, flat), motion)
     config = SceneConfig(
         tracker=TransformsSettings(),
         source=SourceSettings(path=folder / "images", scale=0.5, holdout=holdout or None),
@@ -180,6 +191,8 @@ def made_up_run(
         keyframes=keyframes,
         scene_depth=2.0,
         comparisons=album.comparisons([s for s in scores if s.stage == stages[-1]], folder / "renders"),
+        survey=survey,
+        needles=Needles.of(versions[stages[-1]].gaussians, [(black_frame(i).camera, tracked[i]) for i in keyframes]),
     )
 
 

@@ -12,6 +12,8 @@ from fields.runtime.engine import engine
 from modp_ti.engine.results import Results
 from modp_ti.outputs.report.page import ReportedRun, write_report
 from modp_ti.outputs.report.plots import frame_rate
+from modp_ti.outputs.report.where_wrong import ErrorSurvey
+from pipelines.render.renderer import RenderedView
 from tests.modp_ti.outputs.report.made_up_run import Page, black_frame, delivered, made_up_run, picture
 
 pytestmark = pytest.mark.slow
@@ -93,6 +95,17 @@ def test_a_version_that_knows_no_fitted_frames_has_its_row_beside_one_that_does(
     rows = {row[0]: row[1:] for row in page.tables["numbers"] if row}
     assert rows["online"][0] == f"{online['held_out']['psnr']:.2f}" and rows["online"][5] == "–"
     assert rows["refined"][5] == f"{run.metrics['refined']['fitted']['psnr']:.2f}"
+
+
+def test_where_it_is_wrong_stands_in_tables_whose_shares_sum_to_one(made) -> None:
+    run, page, _ = made
+    assert run.survey.in_words() in page.text
+    rows = {row[0]: row[1:] for row in page.tables["wrong"]}
+    for bins in (run.survey.by_depth(), run.survey.by_angle()):
+        shown = np.array([[float(cell.rstrip(" %")) for cell in rows[of.label][1:3]] for of in bins])
+        np.testing.assert_allclose(shown, [[100 * of.pixels, 100 * of.error] for of in bins], atol=0.051)
+        np.testing.assert_allclose(shown.sum(axis=0), 100, atol=0.05 * len(bins))
+    assert len(page.embedded("wrong", "svg+xml")) == 1
 
 
 def test_without_held_out_frames_the_fitted_ones_are_beside_all(tmp_path) -> None:
@@ -195,7 +208,9 @@ def test_a_run_without_scores_and_one_with_gaps_have_their_pages(tmp_path, recwa
     run.record.frames[:] = [dataclasses.replace(note, mapped_psnr=None) for note in run.record.frames]
     state = {name: values[:0] for name, values in run.versions["online"].gaussians.items()}
     nothing = {"online": dataclasses.replace(run.versions["online"], gaussians=state)}
-    page, _ = written(tmp_path, dataclasses.replace(run, scores=(), comparisons=(), versions=nothing))
+    bare = dataclasses.replace(run, scores=(), comparisons=(), versions=nothing, survey=ErrorSurvey(held_out=False))
+    page, _ = written(tmp_path, bare)
+    assert "wrong" not in page.tables
     assert "way-after" in page.curves() and not [str(w.message) for w in recwarn]
 
 
@@ -224,8 +239,9 @@ def test_a_report_that_fails_costs_a_note_and_not_the_map(tmp_path) -> None:
     for scores, versions in ((list(run.scores), dict(run.versions)), ([], {})):
         with results.writing_figures():
             for i in range(6):
-                image, render = picture(i, (16, 16)), picture(i + 1, (16, 16))
-                results.write_frame(dataclasses.replace(black_frame(i), image=image), render)
+                frame = dataclasses.replace(black_frame(i), image=picture(i, (16, 16)))
+                flat = np.ones((16, 16), np.float32)
+                results.write_frame(frame, RenderedView(picture(i + 1, (16, 16)), flat, flat), None)
             said = results.write_report(run.record, dict(run.metrics), scores, versions, (), 2.0, [])
         if versions:
             page = Page((run.config.output / "report.html").read_text(encoding="utf-8"))
