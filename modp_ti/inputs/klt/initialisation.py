@@ -12,15 +12,28 @@ from modp_ti.inputs.multiview.features import match_anywhere
 from modp_ti.inputs.multiview.reprojection import estimated, pose_from_points, ray_errors
 
 FEWEST_SHARED = 60  # features that two views must share
-# Least motion of the pair, as a share of the image's longer side, and least parallax in degrees. After PATIENCE frames
-# half the parallax is enough.
-LEAST_SHIFT = 0.03
-LEAST_ANGLE = 2.5
-PATIENCE = 90  # frames
+# A share of MOVING of a pair's features must move by LEAST_SHIFT of the image's longer side beyond what a turn
+# explains, and the root mean square of their parallax must reach LEAST_ANGLE degrees. The median would not do: in
+# motion along the view, most features can be far away or near the focus of expansion. After PATIENCE frames half the
+# parallax is enough.
+MOVING, LEAST_SHIFT = 0.25, 0.005
+LEAST_ANGLE = 2.3
+PATIENCE = 60  # frames
+FAR = 0.5  # degrees of parallax below which a feature has no depth, but agrees with the motion
 BETWEEN = 3  # keyframes between the two views
 LONGEST = 400  # frames in memory
 MAX_ERROR = 1.5  # px, RANSAC threshold
 FEWEST_PLACED = 40  # points with parallax
+DRAWS = 3  # of RANSAC, because a wrong rotation and a motion to the side explain far features too
+FOCALS = np.geomspace(0.5, 2.0, 9)  # relative to the assumed focal length
+TURN_STEPS = 6
+
+# What a map that has not begun waits for, in the order of its conditions.
+TEXTURE, MOTION, PARALLAX = (
+    "they need texture, and each must show most of what the one before shows",
+    "it waited for motion, but the camera stands or hovers",
+    "it waited for parallax, but the camera only turns, or is far from everything",
+)
 
 TwoViews = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]
 
@@ -34,10 +47,12 @@ class Initialisation:
 
     Attributes:
         frames: The last LONGEST frames.
+        lacking: Why no map has begun: the condition that failed at the frame that came furthest.
     """
 
     def __init__(self, lens: Lens, seed: int) -> None:
         self.frames: list[Frame] = []
+        self.lacking = TEXTURE
         self._lens = lens
         self._seed = seed
         self._count = 0
@@ -76,6 +91,7 @@ class Initialisation:
         first = self._partner(frame)
         if first is None:
             return None
+        self.lacking = PARALLAX
         share, a, b = np.intersect1d(self.frames[first].ids, frame.ids, return_indices=True)
         least = LEAST_ANGLE if len(self.frames) < PATIENCE else 0.5 * LEAST_ANGLE
         pair = two_views(self._lens, self.frames[first].pixels[a], frame.pixels[b], least, self._seed)
@@ -83,15 +99,15 @@ class Initialisation:
 
     def _partner(self, frame: Frame) -> int | None:
         """Index of the frame with the largest motion to this one, among those that share enough features with it."""
-        size = max(frame.grey.shape)
-        best, best_shift = None, LEAST_SHIFT * size
+        best, best_shift = None, LEAST_SHIFT * max(frame.grey.shape)
         older = len(self.frames) - 1
         for i in range(older - 1, -1, -max(1, older // 40)) if older > 1 else range(older):
             other = self.frames[i]
             share, a, b = np.intersect1d(other.ids, frame.ids, return_indices=True)
             if len(share) < max(FEWEST_SHARED, 0.4 * min(len(other.ids), WANTED)):
                 break
-            shift = float(np.median(np.linalg.norm(other.pixels[a] - frame.pixels[b], axis=1)))
+            self.lacking = PARALLAX if self.lacking == PARALLAX else MOTION
+            shift = _moved(np.linalg.norm(other.pixels[a] - frame.pixels[b], axis=1))
             if shift > best_shift:
                 best, best_shift = i, shift
         return best
@@ -127,7 +143,7 @@ class Initialisation:
             for k in every if steps == 30 else ():
                 landmarks.triangulate(k)
         # The map must keep enough landmarks, with a median reprojection error below 1 px.
-        if len(landmarks.observations([every[-1]])[1]) < max(FEWEST_SHARED // 2, 0.5 * len(share)):
+        if len(landmarks.observations([every[-1]])[1]) < max(FEWEST_SHARED // 2, 0.5 * len(ids)):
             return None
         errors = []
         for keyframe in landmarks.keyframes:
@@ -139,54 +155,88 @@ class Initialisation:
 def two_views(
     lens: Lens, pixels_a: NDArray[np.float64], pixels_b: NDArray[np.float64], min_angle: float, seed: int
 ) -> TwoViews | None:
-    """Estimate the motion between two views from an essential matrix, or a homography for a planar scene.
+    """Estimate the motion between two views from an essential matrix.
 
     Args:
-        lens: The camera of both views.
+        lens: The camera of both views, whose focal length may be wrong.
         pixels_a: (N, 2) features in the first view.
         pixels_b: (N, 2) the same features in the second view.
-        min_angle: Smallest median parallax in degrees. Pure rotation has no parallax.
+        min_angle: Least root mean square of the parallax in degrees; a feature counts with 2 LEAST_ANGLE at most.
         seed: Seed of RANSAC.
 
     Returns:
         T_b_a (4, 4) with a translation of length 1, points (N, 3) in the frame of the first view, and a mask (N,) of
-        the reliable ones; None if the motion cannot be estimated reliably.
+        those with depth; None if a turn without motion explains the views, or the motion cannot be estimated reliably.
     """
     from modp_ti.files.quiet_pycolmap import pycolmap
 
     if len(pixels_a) < FEWEST_PLACED:
         return None
-    options = pycolmap.TwoViewGeometryOptions()
-    options.compute_relative_pose = True
-    options.detect_watermark = False
-    options.ransac.max_error = MAX_ERROR
-    options.ransac.random_seed = seed
-    options.ransac.max_num_trials = 2000
-    pairs = np.repeat(np.arange(len(pixels_a), dtype=np.uint32)[:, None], 2, axis=1)
-    found = estimated(
-        pycolmap.estimate_calibrated_two_view_geometry,
-        lens.camera,
-        np.ascontiguousarray(pixels_a),
-        lens.camera,
-        np.ascontiguousarray(pixels_b),
-        pairs,
-        options,
-    )
-    kinds = pycolmap.TwoViewGeometryConfiguration
-    if found is None or found.config not in (kinds.CALIBRATED, kinds.PLANAR) or found.cam2_from_cam1 is None:
+    rays_a, rays_b = (np.nan_to_num(lens.rays(pixels)) for pixels in (pixels_a, pixels_b))
+    beyond = lens.focal * unturned(rays_a, rays_b, MAX_ERROR / lens.focal)
+    if _moved(beyond) < LEAST_SHIFT * max(lens.camera.width, lens.camera.height):
         return None
-    T = np.eye(4)
-    T[:3] = found.cam2_from_cam1.matrix()
-    length = float(np.linalg.norm(T[:3, 3]))
-    if not np.isfinite(T).all() or length < 1e-9:
+    options = pycolmap.RANSACOptions()
+    options.max_error = MAX_ERROR
+    options.min_num_trials, options.max_num_trials, options.confidence = 100, 2000, 0.999
+    a, b = np.ascontiguousarray(pixels_a), np.ascontiguousarray(pixels_b)
+    best, most, reached = None, 0, 0.0  # consistent features, their parallax
+    for options.random_seed in range(seed, seed + DRAWS):
+        found = estimated(pycolmap.estimate_essential_matrix, a, b, lens.camera, lens.camera, options)
+        if found is None:
+            continue
+        T = np.eye(4)
+        T[:3] = found["cam2_from_cam1"].matrix()
+        length = float(np.linalg.norm(T[:3, 3]))
+        if not np.isfinite(T).all() or length < 1e-9:
+            continue
+        T[:3, 3] /= length
+        xyz, good = triangulated(np.eye(4), T, rays_a, rays_b, 2 * MAX_ERROR / lens.focal, min_angle=FAR)
+        cosine = (_directions(rays_a) * (_directions(rays_b) @ T[:3, :3])).sum(axis=1)
+        angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+        consistent = int((good | (angle < FAR)).sum())
+        if consistent > most:
+            known = np.where(good, np.minimum(angle, 2 * LEAST_ANGLE), 0.0)  # no few near ones decide
+            best, most, reached = (T, xyz, good), consistent, float(np.sqrt(np.mean(known**2)))
+    if best is None or most < 0.5 * len(pixels_a) or best[2].sum() < FEWEST_PLACED or reached < min_angle:
         return None
-    T[:3, 3] /= length
-    xyz, good = triangulated(
-        np.eye(4), T, lens.rays(pixels_a), lens.rays(pixels_b), 2 * MAX_ERROR / lens.focal, min_angle=0.5
-    )
-    if good.sum() < max(FEWEST_PLACED, 0.5 * len(pixels_a)):
-        return None
-    a, b = xyz[good], xyz[good] + T[:3, :3].T @ T[:3, 3]  # from the two cameras
-    a, b = (each / np.linalg.norm(each, axis=1, keepdims=True) for each in (a, b))
-    angle = np.arccos(np.clip((a * b).sum(axis=1), -1.0, 1.0))
-    return (T, xyz, good) if np.degrees(np.median(angle)) >= min_angle else None
+    return best
+
+
+def _moved(lengths: NDArray[np.float64]) -> float:
+    """The length that a share of MOVING of the lengths (N,) reaches."""
+    return float(np.quantile(lengths, 1.0 - MOVING))
+
+
+def unturned(rays_a: NDArray[np.float64], rays_b: NDArray[np.float64], sigma: float) -> NDArray[np.float64]:
+    """Motion between two views that no turn of the camera explains, whatever its focal length.
+
+    With a wrong focal length, a turn looks like motion along a curved wall. So a rotation is fitted for each of
+    `FOCALS` under a Cauchy loss.
+
+    Args:
+        rays_a: (N, 2) normalised coordinates in the first view.
+        rays_b: (N, 2) the same features in the second view.
+        sigma: Scale of the loss, in normalised coordinates.
+
+    Returns:
+        Residuals (N,) of the best fit, in normalised coordinates.
+    """
+    best, least = np.zeros(len(rays_a)), np.inf
+    for focal in FOCALS:
+        a, b = _directions(rays_a / focal), _directions(rays_b / focal)
+        off = np.zeros(len(a))
+        for _ in range(TURN_STEPS):
+            u, _, vt = np.linalg.svd((b / (1.0 + (off / sigma) ** 2)[:, None]).T @ a)
+            p = a @ (u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt).T
+            off = np.linalg.norm(focal * p[:, :2] / np.maximum(p[:, 2:], 0.1) - rays_b, axis=1)
+        cost = float(np.log1p((off / sigma) ** 2).sum())
+        if cost < least:
+            best, least = off, cost
+    return best
+
+
+def _directions(rays: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Unit vectors (N, 3) of normalised coordinates (N, 2)."""
+    rays = np.c_[rays, np.ones(len(rays))]
+    return rays / np.linalg.norm(rays, axis=1, keepdims=True)

@@ -89,6 +89,11 @@ class Odometry:
         return self._joining.refused + (0 if self._loops is None else self._loops.undone)
 
     @property
+    def lacking(self) -> str:
+        """Why no map has begun."""
+        return "" if self._initialisation is None else self._initialisation.lacking
+
+    @property
     def waiting(self) -> list[list[int]]:
         """Numbers of the frames of each map that has not been joined with the run's."""
         return [[view.number for view in each.waiting] for each in self._maps if each.waiting]

@@ -240,8 +240,8 @@ class KltTracker(Tracker):
         if self._trajectory is None:
             before = "" if images.ending is None else f" before the recording ended ({images.ending})"
             raise InputError(
-                f"{images.path}: klt could place none of the {len(names)} images{before}: they need texture, and a "
-                "camera that moves sideways and does not only turn; photographs in no order need tracker.kind=sfm"
+                f"{images.path}: klt could place none of the {len(names)} images{before}: {odometry.lacking}; "
+                "photographs in no order need tracker.kind=sfm"
             )
         if odometry.loops:
             yield f"klt closed {odometry.loops} loops"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,10 +27,13 @@ FINENESS = 90
 
 @dataclass(frozen=True)
 class BoxRoom:
-    """textures: of the six walls, by (axis, side)."""
+    """textures: of the six walls, by (axis, side), repeated over them, coarser far away; low, high: corners [m]."""
 
     camera: PinholeCamera
     textures: dict[tuple[int, int], NDArray[np.uint8]]
+    low: NDArray[np.float64] = field(default_factory=lambda: LOW)
+    high: NDArray[np.float64] = field(default_factory=lambda: HIGH)
+    fineness: float = FINENESS
 
     def image(self, T: NDArray[np.float64]) -> NDArray[np.uint8]:
         """RGB (H, W, 3) seen from T_camera_world; by ray casting of the box and bilinear lookup of its walls."""
@@ -42,15 +45,21 @@ class BoxRoom:
     def colours(self, eye: NDArray[np.float64], rays: NDArray[np.float64]) -> NDArray[np.uint8]:
         """RGB (H, W, 3) that rays (H, W, 3) from `eye` see."""
         with np.errstate(divide="ignore", invalid="ignore"):
-            reach = np.where(rays > 0, (HIGH - eye) / rays, (LOW - eye) / rays)
+            reach = np.where(rays > 0, (self.high - eye) / rays, (self.low - eye) / rays)
         wall = reach.argmin(axis=-1)
         hit = eye + rays * reach.min(axis=-1)[..., None]
         image = np.zeros(rays.shape, np.uint8)
+        coarse = np.log2(np.maximum(self.fineness * reach.min(axis=-1) / self.camera.fx, 1.0)).astype(int)
         for (axis, side), texture in self.textures.items():
             mine = (wall == axis) & ((np.take(rays, axis, axis=-1) > 0) == bool(side))
-            u, v = ((np.take(hit, i, axis=-1) - LOW[i]) * FINENESS for i in range(3) if i != axis)
-            seen = cv2.remap(texture, u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR)
-            image[mine] = seen[mine]
+            place = np.stack([(np.take(hit, i, axis=-1) - self.low[i]) * self.fineness for i in range(3) if i != axis])
+            for level in np.unique(coarse[mine]).tolist():
+                sheet = cv2.resize(texture, None, fx=0.5**level, fy=0.5**level, interpolation=cv2.INTER_AREA)
+                zoom = np.array([sheet.shape[i] / texture.shape[i] for i in (1, 0)])[:, None, None]
+                u, v = ((place + 0.5) * zoom - 0.5).astype(np.float32)
+                seen = cv2.remap(sheet, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+                there = mine & (coarse == level)
+                image[there] = seen[there]
         return image
 
     def mirrored(self) -> BoxRoom:
@@ -65,7 +74,7 @@ class BoxRoom:
         c = self.camera
         rays = np.c_[(pixels[:, 0] - c.cx) / c.fx, (pixels[:, 1] - c.cy) / c.fy, np.ones(len(pixels))] @ T[:3, :3]
         eye = -T[:3, :3].T @ T[:3, 3]
-        return np.where(rays > 0, (HIGH - eye) / rays, (LOW - eye) / rays).min(axis=1)
+        return np.where(rays > 0, (self.high - eye) / rays, (self.low - eye) / rays).min(axis=1)
 
 
 def _texture(rng: np.random.Generator, height: int, width: int) -> NDArray[np.uint8]:

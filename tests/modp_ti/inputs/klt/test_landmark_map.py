@@ -96,6 +96,28 @@ def test_two_views_tell_the_motion_before_a_cloud_and_a_plane_but_not_of_a_turn(
     assert np.median(np.linalg.norm(scale * points - xyz, axis=1)[good]) < 0.35  # 0.016 to 0.161, 12 draws
 
 
+@pytest.mark.parametrize("focal", [0.7, 1.0, 1.4])
+def test_no_turn_is_taken_for_motion_whatever_the_focal_length(focal):
+    xyz = cloud(np.random.default_rng(3))
+    lens = Lens.radial(focal * LENS.focal, 0.0, LENS.camera.width, LENS.camera.height)
+    for angle in (0.05, 0.15, 0.3):
+        T = exp_se3([0, 0, 0, 0.3 * angle, angle, 0.1 * angle])
+        noise = 0.2 * np.random.default_rng(5).standard_normal((2, 200, 2))
+        assert two_views(lens, pixels(np.eye(4), xyz) + noise[0], pixels(T, xyz) + noise[1], 1.0, seed=0) is None
+
+
+def test_motion_along_the_view_is_told_where_most_of_the_features_are_far_away():
+    xyz = cloud(np.random.default_rng(6))
+    xyz[60:] *= 200
+    T = exp_se3([0.05, 0.02, -1.0, 0.01, 0.03, -0.02])
+    noise = 0.3 * np.random.default_rng(7).standard_normal((2, 200, 2))
+    found = two_views(LENS, pixels(np.eye(4), xyz) + noise[0], pixels(T, xyz) + noise[1], 1.15, seed=0)
+    assert found is not None
+    T_b_a, _, good = found
+    assert T_b_a[:3, 3] @ T[:3, 3] / np.linalg.norm(T[:3, 3]) > np.cos(np.radians(2))
+    assert not good[60:].any() and good[:60].sum() > 40
+
+
 def test_triangulation_asks_for_parallax():
     xyz = cloud(np.random.default_rng(4), 50)
     for baseline, reliable in ((0.5, True), (0.01, False)):

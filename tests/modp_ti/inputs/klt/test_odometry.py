@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -80,6 +81,25 @@ def something_as_wide_as_a_third_that_walks_through_the_picture(room: BoxRoom, w
     for i, grey in enumerate(wide):
         grey[:, 8 * i : 8 * i + 105] = walker
     return [np.ascontiguousarray(grey[:, 150:470]) for grey in wide], [*walk.poses]
+
+
+@sequence(0.03)  # of 4.8 m; 0.010 to 0.012
+def forward_through_a_corridor(room: BoxRoom, walk: Walk) -> Sequence:
+    return _forward(replace(room, low=np.array([-1.5, -5.0, 0.0]), high=np.array([1.5, 40.0, 3.0]), fineness=60), 0.08)
+
+
+@sequence(0.08)  # of 7.2 m; 0.030
+def forward_over_a_plain_to_what_is_far_away(room: BoxRoom, walk: Walk) -> Sequence:
+    low, high = np.array([-80.0, -20.0, 0.0]), np.array([80.0, 90.0, 60.0])
+    return _forward(replace(room, low=low, high=high, fineness=60), 0.12)
+
+
+def _forward(room: BoxRoom, step: float) -> Sequence:
+    t = np.arange(60)
+    eyes = np.stack([0.1 * np.sin(0.2 * t), step * t, 1.8 + 0.05 * np.sin(0.15 * t)], axis=1)
+    aims = eyes + np.stack([0.02 * np.sin(0.1 * t), np.ones(60), 0.01 * np.cos(0.1 * t) - 0.08], axis=1)
+    poses = [look_at(eye, aim) for eye, aim in zip(eyes, aims, strict=True)]
+    return [*map(room.grey, poses)], [*poses]
 
 
 def lit(grey: NDArray[np.uint8], gain: NDArray[np.float64] | float) -> NDArray[np.uint8]:
