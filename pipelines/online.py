@@ -121,11 +121,11 @@ class OnlineMapper(Pipeline):
                 companion.before_frame(frame, is_wanted)
             is_keyframe = is_wanted and self.budget.takes_keyframe(frame)
         if is_keyframe:
-            return self._add_keyframe(frame)
+            return self._add_keyframe(frame, last)
         return self._add_points(frame, is_wanted) if len(self.keyframes) else self._report(frame)
 
-    def _add_keyframe(self, frame: TrackedFrame) -> FrameReport:
-        """Add a keyframe, add Gaussians from it, and optimise."""
+    def _add_keyframe(self, frame: TrackedFrame, last: Keyframe | None) -> FrameReport:
+        """Add a keyframe, add Gaussians from it and from the last one of its view, and optimise."""
         view = self._append(frame)
         if len(self.keyframes) > 1 and self.settings.poses.enabled and self.settings.poses.align:
             self.optimiser.poses.align(view)
@@ -139,7 +139,14 @@ class OnlineMapper(Pipeline):
         self.densifier.add_tracked_points(image)
         if self.settings.densify.error_compensation and plan.pixels > 0:
             warming_up = self.frame_count <= self.settings.densify.warm_up
-            self.densifier.add_error_pixels(image, warming_up, plan.pixels)
+            # What comes into view with a keyframe can be matched once it is seen again, so that half of the pixels are
+            # those of the keyframe before.
+            before = None if view.index in self.keyframes.begins else last
+            self.densifier.add_error_pixels(image, warming_up, plan.pixels if before is None else 0.5 * plan.pixels)
+            if before is not None:
+                for companion in self.companions:
+                    companion.before_views([before])
+                self.densifier.add_error_pixels(before.at_level(level), False, 0.5 * plan.pixels)
         psnr = self.optimise(plan.steps, level)
         with self.stopwatch.measure("remove"):
             for companion in self.companions:

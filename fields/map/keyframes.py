@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left, insort
+from bisect import bisect_left, bisect_right, insort
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
@@ -111,6 +111,12 @@ class KeyframeStore:
             if keyframe.index < index and self._of_one_view(keyframe.index, index):
                 found.append(keyframe)
         return found[::-1]
+
+    def around(self, index: int, count: int) -> list[Keyframe]:
+        """Return up to `count` keyframes of the same view before frame `index`, as `before`, and all that follow it."""
+        first = bisect_right(self.selected, index, key=lambda keyframe: keyframe.index)
+        after = [keyframe for keyframe in self.selected[first:] if self._of_one_view(keyframe.index, index)]
+        return self.before(index, count) + after
 
     def _of_one_view(self, a: int, b: int) -> bool:
         """Whether frames a and b show one of the views that are taken at one time."""

@@ -121,8 +121,8 @@ class Paging(Companion):
 
         Raises BlockError as `to_numpy`.
         """
-        area = frame.camera.width * frame.camera.height / (640 * 480)
-        self._prepare(frame, round(self.settings.densify.pixels * area**0.75) if is_wanted else 0, bring=is_wanted)
+        most = self.settings.densify.pixels_of(frame.camera.width, frame.camera.height, candidates=1.0)
+        self._prepare(frame, round(most) if is_wanted else 0, bring=is_wanted)
 
     def after_view(self, place: int) -> None:
         self.away.look(place)

@@ -82,14 +82,13 @@ class Densifier:
     def add_tracked_points(self, view: Keyframe) -> None:
         """Add Gaussians at the tracked points of a view, which becomes an anchor."""
         self.anchors.append(Anchor(self.keyframes[-1], self.settings.voxels.target * view.view_scale))
-        seeds = tracked_seeds(view)
-        self._grow(seeds, view)
+        self._grow(tracked_seeds(view), view, len(self.anchors) - 1)
 
     def add_error_pixels(self, view: Keyframe, warming_up: bool, share: float = 1.0) -> None:
-        """Add Gaussians at pixels of high error of the latest keyframe. Call `add_tracked_points` first.
+        """Add Gaussians at pixels of high error of a keyframe. Call `add_tracked_points` first.
 
         Args:
-            view: The keyframe, or a level of it.
+            view: The keyframe, or a level of it. Of an earlier one, depth is matched in later keyframes as well.
             warming_up: Whether the map is too young to render; pixels are then drawn from the whole image.
             share: Share of `densify.pixels` that is drawn.
         """
@@ -102,16 +101,16 @@ class Densifier:
             column, row = np.floor(pixels).astype(int).T
             depth = self.settings.depth
             limit = np.where(opacity[row, column] < HOLE, depth.hole_deviation, depth.max_deviation)
-            neighbours = self.keyframes.before(view.index, depth.neighbours)
+            neighbours = self.keyframes.around(view.index, depth.neighbours)
             seeds = pixel_seeds(view, neighbours, pixels, self.depth, limit, depth.max_misplacement)
-        self._grow(seeds, view)
+        self._grow(seeds, view, self.first_anchor_since(view))
 
-    def _grow(self, seeds: Seeds, view: Keyframe) -> None:
+    def _grow(self, seeds: Seeds, view: Keyframe, anchor: int) -> None:
         """Add Gaussians at the seeds that the voxels admit. The first seeds settle the voxels around the camera."""
         with self._stopwatch.measure("occupancy"):
             if self.voxels is not None and len(self.gaussians) == 0:
                 self.voxels.settle(self.settings.voxels.coarsest * view.view_scale, view.centre)
-            spacing, anchor = self.anchors[-1].spacing, len(self.anchors) - 1
+            spacing = self.settings.voxels.target * view.view_scale
             grow(self.gaussians, seeds, self.voxels, spacing, self.settings.densify, self.budget, anchor)
 
     def first_anchor_since(self, keyframe: Keyframe) -> int:

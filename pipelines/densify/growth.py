@@ -16,7 +16,7 @@ from fields.voxels.occupancy import OccupancyVoxels
 from pipelines.companions.exposure import scene_colours
 from pipelines.densify.depth.estimate import DepthEstimator, misplacement
 from pipelines.safeguards import MemoryBudget
-from pipelines.settings import DensifySettings
+from pipelines.settings import USUAL_CANDIDATES, DensifySettings
 
 # Deviation of log depth from which a depth contains no information.
 UNKNOWN = 0.5
@@ -85,6 +85,9 @@ def error_pixels(
 ) -> NDArray[np.float64]:
     """Sample pixels of high error regions: 1 - SSIM is high, and there is no tracked point (Section 3.2.2).
 
+    The more of the image is wrong, the more pixels are sampled: where the camera moves far between two keyframes, most
+    of an image is new to the map.
+
     Args:
         view: The view to sample.
         error: 1 - SSIM (H, W) of the map's render; None samples from all valid pixels, as in the warm-up.
@@ -102,7 +105,8 @@ def error_pixels(
     inside = view.points.pixels[view.camera.contains(view.points.pixels)].astype(int)
     candidate[inside[:, 1], inside[:, 0]] = False
     places = np.flatnonzero(candidate)
-    count = min(round(share * settings.pixels * (width * height / (640 * 480)) ** 0.75), len(places))
+    wrong = USUAL_CANDIDATES if error is None else len(places) / (width * height)
+    count = min(round(share * settings.pixels_of(width, height, wrong)), len(places))
     chosen = np.sort(rng.choice(places, count, replace=False))
     return np.stack([chosen % width + 0.5, chosen // width + 0.5], axis=1)
 
