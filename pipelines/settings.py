@@ -126,8 +126,8 @@ class DensifySettings(StrictModel):
     pixels: int = Field(
         default=6000,
         ge=0,
-        description="such pixels per keyframe of 640x480 where 28 percent of its pixels are candidates, and in "
-        "proportion to their share; other sizes by the power 3/4 of their area",
+        description="such pixels per keyframe of 640x480, and in proportion to the candidates if these are more than "
+        "28 percent of it; other sizes by the power 3/4 of their area",
     )
     dissimilarity: float = Field(default=0.08, ge=0, le=1, description="1 - SSIM from which a pixel is a candidate")
     warm_up: int = Field(

@@ -105,7 +105,7 @@ def error_pixels(
     inside = view.points.pixels[view.camera.contains(view.points.pixels)].astype(int)
     candidate[inside[:, 1], inside[:, 0]] = False
     places = np.flatnonzero(candidate)
-    wrong = USUAL_CANDIDATES if error is None else len(places) / (width * height)
+    wrong = USUAL_CANDIDATES if error is None else max(USUAL_CANDIDATES, len(places) / (width * height))
     count = min(round(share * settings.pixels_of(width, height, wrong)), len(places))
     chosen = np.sort(rng.choice(places, count, replace=False))
     return np.stack([chosen % width + 0.5, chosen // width + 0.5], axis=1)

@@ -90,14 +90,21 @@ def test_error_pixels_are_distinct_centres_of_high_error_without_a_tracked_point
     error = np.zeros((120, 160), dtype=np.float32)
     error[20:60, 30:90] = 0.5
     pixels = error_pixels(v, error, DensifySettings(pixels=1600), np.random.default_rng(2))
-    everywhere = error_pixels(v, np.ones_like(error), DensifySettings(pixels=1600), np.random.default_rng(2))
-    assert len(everywhere) / len(pixels) == pytest.approx(error.size / np.count_nonzero(error), rel=0.02)
+    assert len(pixels) == round(1600 * (160 * 120 / (640 * 480)) ** 0.75)
     assert len(np.unique(pixels, axis=0)) == len(pixels)
     np.testing.assert_array_equal(pixels % 1, 0.5)
     column, row = pixels.astype(int).T
     assert (error[row, column] > 0).all()
     tracked = {tuple(p) for p in v.points.pixels[3:].astype(int)}
     assert not tracked & set(zip(column.tolist(), row.tolist(), strict=True))
+
+
+def test_an_image_that_is_mostly_wrong_has_error_pixels_in_proportion() -> None:
+    v, settings = view(), DensifySettings(pixels=1600)
+    half, whole = np.zeros((120, 160), dtype=np.float32), np.full((120, 160), 0.5, dtype=np.float32)
+    half[:, :80] = 0.5
+    few, many = (error_pixels(v, error, settings, np.random.default_rng(2)) for error in (half, whole))
+    assert len(many) / len(few) == pytest.approx(2.0, rel=0.02)
 
 
 def test_pixel_seeds_lie_on_their_rays_at_the_estimated_depth_where_it_is_known() -> None:
