@@ -147,15 +147,9 @@ class DensifySettings(StrictModel):
     prune_every: int = Field(default=100, ge=1, description="frames between removals of transparent Gaussians")
     prune_opacity: float = Field(default=0.01, ge=0, lt=1, description="opacity below which a Gaussian is removed")
 
-    def pixels_of(self, width: int, height: int, candidates: float = USUAL_CANDIDATES) -> float:
-        """Return the number of pixels that a keyframe of this size asks for.
-
-        Args:
-            width: Width of the image [px].
-            height: Height of the image [px].
-            candidates: Share of its pixels that are candidates.
-        """
-        return self.pixels * (width * height / (640 * 480)) ** 0.75 * candidates / USUAL_CANDIDATES
+    def pixels_of(self, width: int, height: int, candidates: float = 0.0) -> float:
+        """Return the number of pixels that a keyframe of this size [px] and share of candidates asks for."""
+        return self.pixels * (width * height / (640 * 480)) ** 0.75 * max(1.0, candidates / USUAL_CANDIDATES)
 
 
 class VoxelSettings(StrictModel):

@@ -16,7 +16,7 @@ from fields.voxels.occupancy import OccupancyVoxels
 from pipelines.companions.exposure import scene_colours
 from pipelines.densify.depth.estimate import DepthEstimator, misplacement
 from pipelines.safeguards import MemoryBudget
-from pipelines.settings import USUAL_CANDIDATES, DensifySettings
+from pipelines.settings import DensifySettings
 
 # Deviation of log depth from which a depth contains no information.
 UNKNOWN = 0.5
@@ -105,8 +105,8 @@ def error_pixels(
     inside = view.points.pixels[view.camera.contains(view.points.pixels)].astype(int)
     candidate[inside[:, 1], inside[:, 0]] = False
     places = np.flatnonzero(candidate)
-    wrong = USUAL_CANDIDATES if error is None else max(USUAL_CANDIDATES, len(places) / (width * height))
-    count = min(round(share * settings.pixels_of(width, height, wrong)), len(places))
+    candidates = 0.0 if error is None else len(places) / (width * height)
+    count = min(round(share * settings.pixels_of(width, height, candidates)), len(places))
     chosen = np.sort(rng.choice(places, count, replace=False))
     return np.stack([chosen % width + 0.5, chosen // width + 0.5], axis=1)
 
