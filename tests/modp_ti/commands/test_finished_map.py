@@ -132,8 +132,8 @@ def test_a_path_of_ones_own_and_a_wider_view(out: Path, tmp_path: Path) -> None:
     assert np.abs(wide[15:45, 20:60] - half).mean() < 12
 
 
-def psnr(renderer: MapRenderer, out: Path, state: dict) -> float:
-    """Mean over the held-out frames [dB] of the Gaussians that some reader found."""
+def mean_squared_error(renderer: MapRenderer, out: Path, state: dict) -> float:
+    """Of the Gaussians that some reader found, over the held-out frames [squared levels of 255]."""
     run = open_run(out)
     full = np.zeros_like(run.gaussians["sh"])
     full[:, : state["sh"].shape[1]] = state["sh"]
@@ -141,28 +141,30 @@ def psnr(renderer: MapRenderer, out: Path, state: dict) -> float:
     errors = []
     for index, (frame, _) in held_out_pairs(out).items():
         picture = renderer.picture(run.cameras[index], run.poses[index]).astype(np.float64)
-        errors.append(-10 * np.log10(((picture - frame) ** 2).mean() / 255**2))
-    return float(np.mean(errors))
+        errors.append(((picture - frame) ** 2).mean())
+    return float(np.exp(np.mean(np.log(errors))))  # as the mean of decibels
 
 
 def test_every_form_of_the_splats_shows_the_same_map(out: Path, taichi_on_the_cpu: None) -> None:
-    """Read by another implementation: at most 0.01 dB from ours for the PLY, 0.3 of 38 dB for what is compressed."""
+    """Read by another implementation: the PLY to the rounding of pictures, what is compressed within 0.75 levels."""
     forms = ("splat", "spz", "sog", "compressed-ply")
     files = {form: done("export", out, "--format", form) for form in forms}
     assert {path.parent for path in files.values()} == {out}
     start_device("cpu")
     run = open_run(out)
     show = MapRenderer(run.gaussians, 80, 60, run.record.near)
-    ours, ply = psnr(show, out, run.gaussians), READERS["ply"](out / "splats.ply")
+    ours, ply = mean_squared_error(show, out, run.gaussians), READERS["ply"](out / "splats.ply")
     metrics = json.loads((out / "metrics.json").read_text())
-    assert ours == pytest.approx(metrics["refined"]["held_out"]["psnr"], abs=0.05)
-    assert abs(psnr(show, out, ply) - ours) <= 0.01
+    in_the_run = 255**2 * 10 ** (-metrics["refined"]["held_out"]["psnr"] / 10)
+    # Frame and render were each rounded to whole levels, whose variance is a twelfth.
+    assert -0.02 <= ours - in_the_run <= 2 / 12 + 0.02
+    assert abs(mean_squared_error(show, out, ply) - ours) <= 0.02
     # `.splat` holds no colours beyond [0, 1] and none that depend on the direction: fitted, it is better than clipped.
     held = np.clip(0.5 + 0.2820948 * ply["sh"][:, :1], 0, 1)
-    clipped = psnr(show, out, {**ply, "sh": (held - 0.5) / 0.2820948})
+    clipped = mean_squared_error(show, out, {**ply, "sh": (held - 0.5) / 0.2820948})
     for form, path in files.items():
-        there = psnr(show, out, READERS[form](path))
-        assert there > clipped if form == "splat" else abs(there - ours) <= 0.3, form
+        there = mean_squared_error(show, out, READERS[form](path))
+        assert there < clipped if form == "splat" else abs(there - ours) <= 0.75, form
 
 
 def test_the_report_links_to_the_page_of_the_map_once_it_is_there(out: Path, tmp_path: Path) -> None:
