@@ -25,6 +25,9 @@ MINUTES = (0.5, 1, 2, 4, 8, 16)
 POINTS = {
     "PSNR": ("psnr", ".2f"),
     "SSIM": ("ssim", ".3f"),
+    "detail": ("detail", ".3f"),
+    "PSNR, fitted": ("fitted", ".2f"),
+    "worst 20 retained": ("retained", ".2f"),
     "Gaussians": ("gaussians", ",.0f"),
     "view renders": ("view_renders", ",.0f"),
     "processor [s]": ("seconds", ",.1f"),
@@ -41,6 +44,9 @@ class Point:
         seconds: Processor time from the first frame on, without compilation and scoring [s].
         psnr: Mean PSNR of the held-out frames [dB].
         ssim: Mean SSIM of the held-out frames.
+        detail: Their detail, see `explained_detail`; None for versions before it.
+        fitted: Mean PSNR of the frames that the map was optimised on [dB]; None for versions before it.
+        retained: PSNR less that just after their own steps, in the worst 20 keyframes in a row [dB].
         gaussians: Size of the map.
         view_renders: Views that were rendered and differentiated.
     """
@@ -50,6 +56,9 @@ class Point:
     seconds: float
     psnr: float
     ssim: float
+    detail: float | None
+    fitted: float | None
+    retained: float | None
     gaussians: int
     view_renders: int
 
@@ -127,8 +136,10 @@ def points_of(metrics: Mapping[str, Any], processor: float, steps: int) -> list[
         if (scores := metrics[stage]) is not None:
             seconds = mapping_seconds(metrics, stage == "refined", NOT_MAPPING)
             seconds = processor * seconds / metrics["seconds"]["total"]
-            psnr, ssim = scores["held_out"]["psnr"], scores["held_out"]["ssim"]
-            points.append(Point(steps, stage, seconds, psnr, ssim, scores["gaussians"], scores["view_renders"]))
+            of, fitted = scores["held_out"], scores.get("fitted", {}).get("psnr")
+            retained = (metrics.get("retention") or {}).get(stage, {}).get("worst")
+            quality = of["psnr"], of["ssim"], of.get("detail"), fitted, retained
+            points.append(Point(steps, stage, seconds, *quality, scores["gaussians"], scores["view_renders"]))
     return points
 
 

@@ -15,7 +15,7 @@ from modp_ti.files.errors import InputError
 
 
 def point(seconds: float, psnr: float, stage: str = "online", steps: int = 1) -> Point:
-    return Point(steps, stage, seconds, psnr, 0.9, 1000, 5000)
+    return Point(steps, stage, seconds, psnr, 0.9, 0.8, psnr + 1, None, 1000, 5000)
 
 
 def test_processor_time_is_divided_as_the_stages_of_the_run(make_metrics: Callable[..., dict]) -> None:
