@@ -32,6 +32,7 @@ class Keyframe:
         points: Tracked points.
         median_depth: Median depth of the tracked points [scene units].
         error: Mean absolute error when the keyframe was last optimised, err(j) of Eq. 2.
+        best_error: The least one that it has had at full size; inf before the first.
         pyramid: Images at halved sizes, the first at the size of `rgba`.
         vignette: Vignette as in `TrackedFrame`, at full size.
         exposure: Affine colour transform (A, b) (3, 4), image = (A colour + b) vignette; None if exposure is not
@@ -51,12 +52,19 @@ class Keyframe:
     points: SparsePoints
     median_depth: float
     error: float
+    best_error: float = float("inf")
     pyramid: tuple[ImageLevel, ...] = ()
     vignette: NDArray[np.float32] | None = None
     exposure: NDArray[np.float64] | None = None
     is_between: bool = False
     transient: NDArray[np.uint8] | None = None
     unmasked: tuple[ImageLevel, ...] = ()
+
+    def note_error(self, error: float, level: int = 0) -> None:
+        """Take in the mean absolute error of a render at a pyramid level."""
+        self.error = error
+        if level == 0:
+            self.best_error = min(self.best_error, error)
 
     @property
     def image_bytes(self) -> int:

@@ -126,6 +126,12 @@ class KeyframeStore:
         """Return the errors (N,) of all keyframes."""
         return np.fromiter((k.error for k in self._keyframes), np.float64, len(self._keyframes))
 
+    def sinking(self) -> NDArray[np.float64]:
+        """Return log(error / best error) (N,) of all keyframes: 0 where it is the best, or none is known."""
+        best = np.fromiter((k.best_error for k in self._keyframes), np.float64, len(self._keyframes))
+        errors = np.maximum(self.errors(), 1e-12)
+        return np.log(errors / np.clip(best, 1e-12, errors))
+
     def _kept(self, frame: TrackedFrame, levels: int) -> tuple[ImageLevel, ...]:
         """First `levels` levels of a frame's pyramid, except those that are smaller than `min_side`."""
         first, *others = frame.pyramid[:levels]
@@ -274,6 +280,7 @@ NUMBERS: dict[str, tuple[int, ...]] = {
     "T_camera_world": (4, 4),
     "median_depth": (),
     "error": (),
+    "best_error": (),
 }
 POINTS = {"xyz": 3, "pixels": 2}
 NO_MASK = np.zeros((0, 0), dtype=np.uint8)
@@ -335,7 +342,8 @@ class KeyframeRows:
             raise ValueError(f"frame {frame.index} is not keyframe {row}")
         view = store.append(frame, bool(self._arrays["is_between"][row]))
         view.T_camera_world = np.array(self._arrays["T_camera_world"][row])
-        view.median_depth, view.error = (float(self._arrays[name][row]) for name in ("median_depth", "error"))
+        for name in ("median_depth", "error", "best_error"):
+            setattr(view, name, float(self._arrays[name][row]))
         exposure = self._arrays["exposure"][row]
         view.exposure = None if np.isnan(exposure).all() else np.array(exposure)
         own = slice(self._first[row], self._first[row + 1])

@@ -35,7 +35,7 @@ from pipelines.state import MapState, save_state
 
 FILE = "snapshot.npz"
 # Version of the arrays and the JSON. Others are refused, as they hold the state of different code.
-VERSION = 7
+VERSION = 8
 ABOUT = "about"
 AGAIN = "; start the run from its scene"
 UNKNOWN = np.full((3, 4), np.nan)

@@ -49,9 +49,9 @@ class MapOptimiser:
         self.safeguards = Safeguards()
         self.poses = PoseRefinement(self.safeguards)
         self.exposure = ExposureRefinement(settings.exposure, self.safeguards)
-        # Results of steps that have not been applied yet: loss values of the views, and updates of pose and exposure by
-        # frame index. Both are empty between steps on the CPU.
-        self._unread: deque[list[tuple[Keyframe, LossValues]]] = deque()
+        # Results of steps that have not been applied yet: loss values of the views, with the level of each step, and
+        # updates of pose and exposure by frame index. Both are empty between steps on the CPU.
+        self._unread: deque[tuple[list[tuple[Keyframe, LossValues]], int]] = deque()
         self._moves: dict[int, list[Callable[[], None]]] = {}
         self._psnr = float("nan")
         self.companions = companions
@@ -124,9 +124,9 @@ class MapOptimiser:
                 companion.before_views(batch)
             seen += self._step(store, views[first : first + size], rates, pose_rate, level)
         self.loss.send()
-        self._unread.append(seen)
+        self._unread.append((seen, level))
         while len(self._unread) > self.loss.lag:
-            self._read(self._unread.popleft())
+            self._read(*self._unread.popleft())
         return self._psnr
 
     def settle(self) -> float:
@@ -136,16 +136,16 @@ class MapOptimiser:
             Mean PSNR of the last step's views.
         """
         while self._unread:
-            self._read(self._unread.popleft())
+            self._read(*self._unread.popleft())
         self._move()
         return self._psnr
 
-    def _read(self, seen: list[tuple[Keyframe, LossValues]]) -> None:
-        """Apply the loss values of a step's views."""
+    def _read(self, seen: list[tuple[Keyframe, LossValues]], level: int) -> None:
+        """Apply the loss values of a step's views at a pyramid level."""
         sound = [(view, values) for view, values in seen if np.isfinite(values.l1)]
         self.safeguards.views += len(seen) - len(sound)
         for view, values in sound:
-            view.error = values.l1
+            view.note_error(values.l1, level)
         if sound:
             self._psnr = float(np.mean([values.psnr for _, values in sound]))
 

@@ -30,19 +30,27 @@ class ViewSelection(Protocol):
 
 
 def global_probabilities(
-    store: KeyframeStore, error_weight: float, recency_weight: float, among: NDArray[np.int64]
+    store: KeyframeStore,
+    error_weight: float,
+    recency_weight: float,
+    among: NDArray[np.int64],
+    recovery: float = 0.0,
 ) -> NDArray[np.float64]:
     """Probabilities (N,) of keyframes in the draw of global views (Eq. 2).
 
-    p(j) is proportional to exp(error_weight err(j)) exp(recency_weight (j - last)).
+    p(j) is proportional to exp(error_weight err(j)) exp(recency_weight (j - last)) (err(j) / best(j))^recovery. The
+    last factor is no part of the paper.
 
     Args:
         store: The keyframes.
         error_weight: Weight of the errors.
         recency_weight: Weight of the places.
         among: Places (N,) of the keyframes that may be drawn.
+        recovery: Weight of how far a keyframe has fallen below its own best.
     """
     exponent = error_weight * store.errors()[among] + recency_weight * (among - (len(store) - 1))
+    if recovery:
+        exponent += recovery * store.sinking()[among]
     p = np.exp(exponent - exponent.max())
     return p / p.sum()
 

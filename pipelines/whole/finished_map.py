@@ -98,7 +98,7 @@ def take_in_gaussians(mapper: OnlineMapper, gaussians: Mapping[str, NDArray]) ->
         mapper.paging.before_views([view])
         values = mapper.optimiser.compare(view, mapper.keyframes.scene_depth)
         if np.isfinite(values.l1):
-            view.error = values.l1
+            view.note_error(values.l1)
 
 
 def _view_of(mapper: OnlineMapper, frame: TrackedFrame, is_keyframe: bool) -> Keyframe | None:

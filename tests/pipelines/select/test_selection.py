@@ -141,6 +141,16 @@ def test_global_probabilities_are_equation_2() -> None:
     np.testing.assert_allclose(p, np.array(weights)[[0, 2]] / (weights[0] + weights[2]))
 
 
+def test_keyframes_that_have_fallen_below_their_own_best_are_drawn_more() -> None:
+    keyframes = store([0.03, 0.03, 0.03, 0.03])
+    keyframes[1].note_error(0.01, level=1)  # of a smaller image, whose errors are smaller
+    keyframes[1].note_error(0.03)
+    keyframes[2].note_error(0.02)
+    keyframes[2].note_error(0.03)
+    p = global_probabilities(keyframes, 20.0, 0.0, np.arange(4), recovery=3.0)
+    np.testing.assert_allclose(p / p[0], [1.0, 1.0, 1.5**3, 1.0])
+
+
 def test_a_step_looks_at_one_current_one_local_and_four_global_views() -> None:
     views = LocalGlobalViews(ViewSettings(local_views=1, global_views=4), np.random.default_rng(0))
     keyframes = store([0.1] * 30)
