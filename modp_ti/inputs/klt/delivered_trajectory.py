@@ -51,7 +51,8 @@ class DeliveredTrajectory:
         if view.keyframe not in self._keyframes:
             self._remember([view.keyframe])
         xyz, rays = landmarks.xyz[view.ids], landmarks.lens.rays(view.pixels)
-        good = landmarks.known[view.ids] & (ray_errors(T, xyz, rays) * landmarks.lens.focal < MAX_ERROR)
+        good = landmarks.known[view.ids] & ~landmarks.assumed[view.ids]
+        good &= (ray_errors(T, xyz, rays) * landmarks.lens.focal) < MAX_ERROR
         pixels = rays[good] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
         points = points_inside(xyz[good], pixels, view.ids[good], self._undistorter, T)
         return PosedImage(name, self._undistorter, T, points)
@@ -117,7 +118,9 @@ class DeliveredTrajectory:
 
     def _known(self) -> NDArray[np.int64]:
         """Ids of the landmarks that were delivered and still have a position."""
-        return np.flatnonzero(~np.isnan(self._xyz[:, 0]) & self._tracking.map.known[: len(self._xyz)])
+        landmarks, count = self._tracking.map, len(self._xyz)
+        firm = landmarks.known[:count] & ~landmarks.assumed[:count]
+        return np.flatnonzero(~np.isnan(self._xyz[:, 0]) & firm)
 
     def _keyframe(self, number: int) -> Keyframe:
         return self._tracking.map.keyframes[self._tracking.map.index(number)]

@@ -20,10 +20,14 @@ from modp_ti.inputs.multiview.reprojection import ray_errors
 MAX_ERROR = 2.5
 # Smallest angle [degrees] between the rays of a new landmark. With less parallax its depth is unreliable.
 MIN_ANGLE = 1.2
+# Landmarks of a keyframe below which the depths of other features are assumed, and below which these carry the scale.
+SCARCE, WEAK = 80, 20
+NEAREST = 5  # landmarks from which a depth is assumed
 # The arrays of the landmarks: shape of an element, type, and value of free places.
 LANDMARKS = {
     "xyz": ((3,), np.float64, 0),
     "known": ((), np.bool_, 0),
+    "assumed": ((), np.bool_, 0),
     "first": ((), np.int64, -1),
     "first_pixel": ((2,), np.float64, 0),
     "last": ((), np.int64, -1),
@@ -41,11 +45,13 @@ class Keyframe(LocalisedFrame):
         rays: (N, 2) undistorted normalised coordinates of its features.
         described_ids: (M,) the feature id of each SIFT feature, -1 for none.
         scale: What the scale of the map around it has grown by since it was made.
+        weak: Whether hardly any of its landmarks had a triangulated depth when it was made.
     """
 
     rays: NDArray[np.float64] = field(kw_only=True)
     described_ids: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     scale: float = 1.0
+    weak: bool = False
 
     @property
     def described(self) -> Features:
@@ -84,7 +90,8 @@ class LandmarkMap:
         keyframes: The keyframes in order.
         count: Number of ids that were given.
         xyz: (C, 3) positions in the world.
-        known: (C,) whether the feature is triangulated, and so is a landmark.
+        known: (C,) whether the feature has a position, and so is a landmark.
+        assumed: (C,) whether its depth is assumed, because no two keyframes have seen it with parallax.
         first: (C,) keyframe that saw the feature first; -1 for none.
         first_pixel: (C, 2) its pixel there.
         last: (C,) keyframe that saw it last; -1 for none.
@@ -96,6 +103,7 @@ class LandmarkMap:
 
     xyz: NDArray[np.float64]
     known: NDArray[np.bool_]
+    assumed: NDArray[np.bool_]
     first: NDArray[np.int64]
     first_pixel: NDArray[np.float64]
     last: NDArray[np.int64]
@@ -149,7 +157,7 @@ class LandmarkMap:
         ids = self.new_ids(count)
         mine, others = self.keyframes, other.keyframes
         self.keyframes = sorted([*mine, *others], key=lambda keyframe: keyframe.number)
-        for name in ("known", "looked", "found", "first_pixel", "last_pixel"):
+        for name in ("known", "assumed", "looked", "found", "first_pixel", "last_pixel"):
             getattr(self, name)[ids] = getattr(other, name)[:count]
         self.xyz[ids] = moved_points(S_self_other, other.xyz[:count])
         for rows, keyframes, source in ((np.arange(offset), mine, self), (ids, others, other)):
@@ -198,7 +206,8 @@ class LandmarkMap:
     def triangulate(self, k: int) -> None:
         """Triangulate features of keyframe k with their first observation."""
         keyframe = self.keyframes[k]
-        slots = np.flatnonzero(~self.known[keyframe.ids] & (self.first[keyframe.ids] >= 0))
+        without = ~self.known[keyframe.ids] | self.assumed[keyframe.ids]
+        slots = np.flatnonzero(without & (self.first[keyframe.ids] >= 0))
         slots = slots[self.first[keyframe.ids[slots]] != k]
         for first in np.unique(self.first[keyframe.ids[slots]]):
             other = self.keyframes[first]
@@ -209,7 +218,41 @@ class LandmarkMap:
                 other.T_camera_world, keyframe.T_camera_world, rays, keyframe.rays[mine], MAX_ERROR / self.lens.focal
             )
             self.xyz[ids[good]] = xyz[good]
-            self.known[ids[good]] = True
+            self.known[ids[good]], self.assumed[ids[good]] = True, False
+
+    @property
+    def weak_joints(self) -> list[int]:
+        """Indices of the keyframes from which the scale is that of assumed depths."""
+        weak = np.array([False, *(keyframe.weak for keyframe in self.keyframes)])
+        return np.flatnonzero(weak[1:] & ~weak[:-1]).tolist()
+
+    def assume(self, ids: NDArray[np.int64], xyz: NDArray[np.float64]) -> None:
+        """Give those features (N,) that are no landmarks assumed positions (N, 3), which adjustments do not move."""
+        new = ~self.known[ids]
+        self.xyz[ids[new]] = xyz[new]
+        self.known[ids[new]] = self.assumed[ids[new]] = True
+
+    def assume_depths(self, k: int) -> None:
+        """Where landmarks of keyframe k are scarce, assume depths for features that a turn alone explains.
+
+        Each takes the median depth of the NEAREST landmarks around it.
+        """
+        keyframe, T = self.keyframes[k], self.keyframes[k].T_camera_world
+        known = self.known[keyframe.ids]
+        keyframe.weak = int((known & ~self.assumed[keyframe.ids]).sum()) < WEAK
+        if not 0 < known.sum() < SCARCE:
+            return
+        seen, slots = np.flatnonzero(known), np.flatnonzero(~known)
+        depth = self.xyz[keyframe.ids[seen]] @ T[2, :3] + T[2, 3]
+        away = np.linalg.norm(keyframe.pixels[slots, None] - keyframe.pixels[seen], axis=2)
+        near = np.argsort(away, axis=1, kind="stable")[:, :NEAREST]
+        ids, first = keyframe.ids[slots], self.first[keyframe.ids[slots]]
+        xyz = unprojected(T, keyframe.rays[slots], np.median(depth[near], axis=1))
+        for other in np.unique(first[(first >= 0) & (first != k)]):
+            mine = first == other
+            rays = self.lens.rays(self.first_pixel[ids[mine]])
+            fits = ray_errors(self.keyframes[other].T_camera_world, xyz[mine], rays) * self.lens.focal < MAX_ERROR
+            self.assume(ids[mine][fits], xyz[mine][fits])
 
     def discard_outliers(self, keyframes: Iterable[int]) -> None:
         """Remove outlier observations of these keyframes, and landmarks that fewer than two keyframes still see."""
@@ -220,6 +263,9 @@ class LandmarkMap:
             error = np.zeros(len(known))
             error[known] = ray_errors(keyframe.T_camera_world, self.xyz[keyframe.ids[known]], keyframe.rays[known])
             wrong = error * self.lens.focal > MAX_ERROR
+            doubted = keyframe.ids[wrong & self.assumed[keyframe.ids]]  # the depth is wrong, not the observation
+            wrong &= ~self.assumed[keyframe.ids]
+            self.known[doubted] = self.assumed[doubted] = False
             touched.append(keyframe.ids[wrong])
             keyframe.keep(~wrong)
         touched = np.unique(np.concatenate(touched))
@@ -267,7 +313,10 @@ class LandmarkMap:
             return float("inf")
         poses = {k: self.keyframes[k].T_camera_world for k in views}
         solve = adjusted_apart if apart else adjusted_bundle
-        bundle = solve(self.lens.camera, poses, of, ids, pixels, self.xyz, set(free), steps, refined=refined)
+        held_points = np.unique(ids[self.assumed[ids]]).tolist()
+        bundle = solve(
+            self.lens.camera, poses, of, ids, pixels, self.xyz, set(free), steps, refined=refined, held=held_points
+        )
         if bundle is None:
             self.unsolved += 1
             return float("inf")
@@ -299,6 +348,14 @@ class LandmarkMap:
             for each in self.keyframes
         ]
         return other
+
+
+def unprojected(
+    T_camera_world: NDArray[np.float64], rays: NDArray[np.float64], depth: NDArray[np.float64] | float
+) -> NDArray[np.float64]:
+    """Points (N, 3) in the world at depths (N,) along normalised coordinates (N, 2) of a camera with a pose (4, 4)."""
+    points = np.c_[rays, np.ones(len(rays))] * np.reshape(depth, (-1, 1)) - T_camera_world[:3, 3]
+    return points @ T_camera_world[:3, :3]
 
 
 def triangulated(

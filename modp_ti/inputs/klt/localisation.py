@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from fields.geometry.se3 import inverse_se3
 from modp_ti.inputs.klt.frame import BORDER, Frame, LocalisedFrame
-from modp_ti.inputs.klt.landmark_map import LandmarkMap
+from modp_ti.inputs.klt.landmark_map import LandmarkMap, unprojected
 from modp_ti.inputs.multiview.reprojection import pose_from_points, ray_errors, refine_pose
 
 MAX_ERROR = 3.0  # landmarks with a larger reprojection error [px] are no longer tracked
@@ -57,7 +57,7 @@ def localised(landmarks: LandmarkMap, frame: Frame, T_guess: NDArray[np.float64]
     if good.sum() < max(FEWEST, 0.3 * len(known)):
         return None
     kept = np.ones(len(frame.ids), dtype=bool)
-    kept[known] = good
+    kept[known] = good | landmarks.assumed[frame.ids[known]]  # of an assumed depth, the track may be right
     return LocalisedFrame(frame.number, frame.grey, frame.valid, frame.ids[kept], frame.pixels[kept], T_camera_world=T)
 
 
@@ -73,8 +73,7 @@ def predicted_pixels(
     world = landmarks.xyz[last.ids].copy()
     depth = world[known] @ T_last[2, :3] + T_last[2, 3]
     typical = float(np.median(depth)) if len(depth) else 1.0
-    rays = lens.rays(last.pixels[~known])
-    world[~known] = (np.c_[rays, np.ones(len(rays))] * typical - T_last[:3, 3]) @ T_last[:3, :3]
+    world[~known] = unprojected(T_last, lens.rays(last.pixels[~known]), typical)
     guess = lens.pixels(world @ T[:3, :3].T + T[:3, 3])
     # The reprojection error of each feature is assumed to persist.
     guess = guess + (last.pixels - lens.pixels(world @ T_last[:3, :3].T + T_last[:3, 3]))

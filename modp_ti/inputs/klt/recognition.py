@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.geometry.se3 import inverse_se3, motion_around, moved_pose, scale_of
-from modp_ti.inputs.klt.landmark_map import Keyframe, LandmarkMap
+from modp_ti.inputs.klt.landmark_map import Keyframe, LandmarkMap, unprojected
 from modp_ti.inputs.multiview.appearance import nearest_words, vlad
 from modp_ti.inputs.multiview.features import Features, epipolar_lines, essential_matrix, match_anywhere
 from modp_ti.inputs.multiview.reprojection import pose_from_points, ray_errors
@@ -45,7 +45,7 @@ def thumbnail(grey: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 
 def place_by_features(
-    landmarks: LandmarkMap, keyframe: Keyframe, features: Features, seed: int
+    landmarks: LandmarkMap, keyframe: Keyframe, features: Features, seed: int, assumed: bool = False
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]] | None:
     """Localise a frame by SIFT matches with a keyframe.
 
@@ -54,6 +54,7 @@ def place_by_features(
         keyframe: One of its keyframes.
         features: SIFT features of the frame.
         seed: Seed of RANSAC.
+        assumed: Whether features count whose depth is not certain; then more must agree.
 
     Returns:
         T_camera_world (4, 4) of the frame, and the matches (M, 2) that agree: indices of SIFT features in the keyframe
@@ -62,13 +63,14 @@ def place_by_features(
     pairs = match_anywhere(keyframe.described, features)
     if len(pairs) < FEWEST:
         return None
-    xyz = world_points(landmarks, keyframe)[pairs[:, 0]]
+    xyz = world_points(landmarks, keyframe, assumed)[pairs[:, 0]]
     placed = np.isfinite(xyz).all(axis=1)
     if placed.sum() < FEWEST:
         return None
     rays = landmarks.lens.rays(features.pixels[pairs[:, 1]])
     found = pose_from_points(xyz[placed], rays[placed], MAX_ERROR / landmarks.lens.focal, seed)
-    if found is None or found[1].sum() < max(FEWEST, 0.2 * placed.sum()):
+    fewest, share = (2 * FEWEST, 0.5) if assumed else (FEWEST, 0.2)
+    if found is None or found[1].sum() < max(fewest, share * placed.sum()):
         return None
     agreeing = np.ones(len(pairs), dtype=bool)
     agreeing[placed] = found[1]
@@ -110,11 +112,11 @@ def inherited(
     return keyframe.described_ids[slots], b
 
 
-def world_points(landmarks: LandmarkMap, keyframe: Keyframe) -> NDArray[np.float64]:
+def world_points(landmarks: LandmarkMap, keyframe: Keyframe, assumed: bool = False) -> NDArray[np.float64]:
     """World points (M, 3) of a keyframe's SIFT features; NaN where the depth is unknown.
 
     A feature that is a landmark has its position. Any other takes the depth of a landmark at the same pixel, or of the
-    landmarks around it if they agree.
+    landmarks around it if they agree; if `assumed`, even if they do not.
     """
     pixels, ids = keyframe.described.pixels, keyframe.described_ids
     xyz = np.full((len(pixels), 3), np.nan)
@@ -134,9 +136,8 @@ def world_points(landmarks: LandmarkMap, keyframe: Keyframe) -> NDArray[np.float
     agree = (np.ptp(around, axis=1) < 0.1 * middle) & (away.max(axis=1) < NEIGHBOURHOOD) & (middle > 0)
     at_one = away.min(axis=1) < AT_LANDMARK
     z = np.where(at_one, around[np.arange(len(around)), away.argmin(axis=1)], middle)
-    lent = np.flatnonzero((agree | at_one) & ~np.isfinite(xyz[:, 0]) & (z > 0))
-    point = np.c_[landmarks.lens.rays(pixels[lent]), np.ones(len(lent))] * z[lent, None] - T[:3, 3]
-    xyz[lent] = point @ T[:3, :3]
+    lent = np.flatnonzero((agree | at_one | assumed) & ~np.isfinite(xyz[:, 0]) & (z > 0))
+    xyz[lent] = unprojected(T, landmarks.lens.rays(pixels[lent]), z[lent])
     return xyz
 
 

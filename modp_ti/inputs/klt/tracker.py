@@ -271,6 +271,13 @@ class KltTracker(Tracker):
                 f"run's map; the largest has {len(largest)} images, {names[largest[0]]} to {names[largest[-1]]}: "
                 f"{mapped}"
             )
+        tracking = odometry.tracking
+        weak = [] if tracking is None else [names[tracking.map.keyframes[k].number] for k in tracking.map.weak_joints]
+        if weak:
+            yield (
+                f"{len(weak)} weak joints: the camera turned without parallax, and the size of what was mapped from "
+                f"{', '.join(weak[:5])} on is assumed"
+            )
         if odometry.unsolved:
             yield (
                 f"{odometry.unsolved} bundle adjustments of klt had no solution and were left out: "

@@ -13,7 +13,7 @@ from modp_ti.inputs.klt.camera import CameraRefinement
 from modp_ti.inputs.klt.frame import Frame, LocalisedFrame
 from modp_ti.inputs.klt.landmark_map import LandmarkMap
 from modp_ti.inputs.klt.localisation import FEWEST, SIGMA, localised, predicted_pixels, realigned, searched
-from modp_ti.inputs.klt.recognition import inherited, place_by_features, thumbnail
+from modp_ti.inputs.klt.recognition import inherited, place_by_features, thumbnail, world_points
 from modp_ti.inputs.multiview.bundle_adjustment import Refinable
 from modp_ti.inputs.multiview.reprojection import refine_pose
 
@@ -21,6 +21,7 @@ from modp_ti.inputs.multiview.reprojection import refine_pose
 # keyframe, or if less than KEYFRAME_SHARE of its landmarks are still seen.
 KEYFRAME_SHIFT = 0.05
 KEYFRAME_SHARE = 0.65
+SHARE_ASSUMED = 0.4  # of KEYFRAME_SHIFT, while landmarks have assumed depths
 WINDOW = 8  # free keyframes of a local bundle adjustment
 HELD = 12  # fixed keyframes of a local bundle adjustment, at most
 LEAST_SHARED = 15  # landmarks that they share with the free ones
@@ -207,6 +208,8 @@ class Tracking:
             return True
         shift = float(np.median(np.linalg.norm(last.pixels[a] - frame.pixels[b], axis=1)))
         share_of_shift = 1.0 if self._refinement is None else self._refinement.share_of_shift
+        if self.map.assumed[last.ids].any():  # the sooner depths are triangulated, the better
+            share_of_shift *= SHARE_ASSUMED
         return shift > share_of_shift * KEYFRAME_SHIFT * max(frame.grey.shape)
 
     def _make_keyframe(self, frame: LocalisedFrame) -> View:
@@ -219,6 +222,7 @@ class Tracking:
         k = self.map.add_keyframe(frame, frame.T_camera_world)
         self._replenish(frame)
         self.map.triangulate(k)
+        self.map.assume_depths(k)
         self._adjust()
         keyframe = self.map.keyframes[k]
         still = np.isin(frame.ids, keyframe.ids)
@@ -360,15 +364,24 @@ class Tracking:
         return view
 
     def _placed(self, frame: Frame, candidates: Iterable[int]) -> View | None:
-        """Localise the frame against the first candidate keyframe that fits, and make it a keyframe."""
-        for k in candidates:
-            placed = place_by_features(self.map, self.map.keyframes[k], frame.described, self._seed)
+        """Localise the frame against the first candidate keyframe that fits, and make it a keyframe.
+
+        If none does, depths are assumed where they are not known.
+        """
+        candidates = list(candidates)
+        for k, assumed in [*((k, False) for k in candidates), *((k, True) for k in candidates)]:
+            keyframe = self.map.keyframes[k]
+            placed = place_by_features(self.map, keyframe, frame.described, self._seed, assumed)
             if placed is None:
                 continue
             T, pairs = placed
             located = LocalisedFrame(frame.number, frame.grey, frame.valid, T_camera_world=T)
             located.append(*searched(self.map, located))
             located.append(*inherited(self.map, k, frame.described, pairs, T))
+            if assumed:
+                own = keyframe.described_ids
+                own, at = own[own >= 0], world_points(self.map, keyframe, assumed)[own >= 0]
+                self.map.assume(own[np.isin(own, located.ids)], at[np.isin(own, located.ids)])
             located = self._localised(located, T)
             if located is not None:
                 self.motion = np.eye(4)

@@ -53,6 +53,7 @@ def adjusted_bundle(
     steps: int,
     loss_width: float = 1.0,
     refined: Collection[Refinable] = (),
+    held: Collection[int] = (),
 ) -> Bundle | None:
     """Minimise the reprojection error under a Cauchy loss over poses and points.
 
@@ -68,6 +69,7 @@ def adjusted_bundle(
         steps: Levenberg-Marquardt steps at most.
         loss_width: Scale of the Cauchy loss [px].
         refined: Parts of the camera that are optimised too.
+        held: Points that stay where they are.
 
     Returns:
         The optimised poses, camera and points, without those that only one view observes; None if Ceres finds no usable
@@ -80,6 +82,9 @@ def adjusted_bundle(
     tracks = _add_views(model, config, poses, view, point, pixels, free)
     # One ray constrains nothing, and COLMAP refuses it.
     names = {number: model.add_point3D(xyz[number], track) for number, track in tracks if track.length() > 1}
+    for number in held:
+        if number in names:
+            config.add_constant_point(names[number])
     if len(free) == len(poses):
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     if not refined:

@@ -114,6 +114,16 @@ def turning_walk(frames: int) -> list[NDArray[np.float64]]:
     return [look_at(eye, aim) for eye, aim in zip(eyes, aims, strict=True)]
 
 
+def turn_on_the_spot(T: NDArray[np.float64], degrees: float, frames: int) -> list[NDArray[np.float64]]:
+    """T_camera_world of a camera that turns to the right from a pose, and then goes sideways for 30 frames."""
+    eye, z = -T[:3, :3].T @ T[:3, 3], T[2, :3]
+    angle = np.arctan2(z[1], z[0]) - np.radians(degrees) * np.minimum(np.arange(1, frames + 31) / frames, 1.0)
+    along = np.array([-np.sin(angle[-1]), np.cos(angle[-1]), 0.0])
+    eyes = eye + 0.03 * np.maximum(np.arange(1, frames + 31) - frames, 0)[:, None] * along
+    aims = eyes + np.stack([np.cos(angle), np.sin(angle), np.full(len(angle), -0.05)], axis=1)
+    return [look_at(eye, aim) for eye, aim in zip(eyes, aims, strict=True)]
+
+
 @dataclass(frozen=True)
 class Walk:
     poses: list[NDArray[np.float64]]
