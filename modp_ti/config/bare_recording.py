@@ -1,6 +1,6 @@
 """The scene of `modp-ti run` on a recording or a stream: defaults, output `out/NAME`.
 
-The tracker is `klt`, or that of the capture or bag if its poses come with the images.
+The tracker is that of poses that come with the images; otherwise `klt` for a sequence, and `sfm` for photographs.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from modp_ti.inputs.reader import kind_of
 from modp_ti.inputs.readers import READERS, SOURCES
 from modp_ti.inputs.sources.image_folder import IMAGE_SUFFIXES, NOT_READ, ImageFolder, ListedImages
 from modp_ti.inputs.sources.video_file import VIDEO_SUFFIXES, is_video
+from modp_ti.inputs.steps import why_photographs
 
 OUTPUTS = Path("out")
 SCENE = "scene.yaml"
@@ -122,20 +123,26 @@ def recorded_scene(
     tracker, poses = next(found, ("", path))
     if tracker and poses == path:  # the recording itself brings them
         return settings({"kind": tracker})
-    config = settings({"kind": "klt"})
-    if any(override.strip().startswith("tracker.") for override in overrides):
+    named = any(override.strip().startswith("tracker.") for override in overrides)
+    config = settings({"kind": "klt"} | ({} if named else {"fallback": "sfm"}))
+    if named:
         return config
     if tracker and (tracker != "tum" or config.source.intrinsics.given or _is_calibrated(config)):
         say(f"the poses of {poses} are used; tracker.kind=klt would track the images alone")
         return settings({"kind": tracker, "path": str(poses)})
     if tracker:
         say(f"{poses} is not used without source.intrinsics (tracker.kind=tum): klt tracks the images")
+    names = ImageFolder(images, masks=config.source.masks).names if kind == "images" else []
     if kind == "images" and not config.source.panorama.model_fields_set:
-        first = ImageFolder(images).names[:1]
         with suppress(UnreadableImageError):
-            if is_panoramic(ListedImages(images, first, [0.0]), first[0]):
+            if is_panoramic(ListedImages(images, names[:1], [0.0]), names[0]):
                 say(f"{images}: the images see all round: source.panorama.projection=equirectangular")
                 return settings({"kind": "sfm"}, "source.panorama.projection=equirectangular")
+    if not config.is_realtime:
+        chosen = names[config.source.start : config.source.stop : config.source.step]
+        if (why := why_photographs([images / name for name in chosen])) is not None:
+            say(f"{images}: {why}: tracker.kind=sfm, for photographs; tracker.kind=klt follows a sequence")
+            return settings({"kind": "sfm"})
     return config
 
 

@@ -17,11 +17,13 @@ from modp_ti.config.settings import SceneConfig
 from modp_ti.engine.interruption import RunStopped
 from modp_ti.engine.recording import RecordedSession
 from modp_ti.engine.results import Results, metrics_of, peak_memory_mb
+from modp_ti.engine.second_tracker import better_tracker
 from modp_ti.engine.snapshot import FILE, Snapshot
 from modp_ti.engine.stages import FinishedMap, finish_map, map_stream, open_run
 from modp_ti.engine.stream import FramesAhead
 from modp_ti.files.errors import InputError
 from modp_ti.files.run_folder import run_folder
+from modp_ti.inputs.protocol import NothingPlacedError
 from modp_ti.inputs.timed_poses import true_poses
 from modp_ti.outputs.evaluation import FrameScore, evaluate, trajectory_errors
 from modp_ti.outputs.progress import ProgressLine, StageProgress
@@ -40,7 +42,8 @@ def run_scene(
     """Map a scene and write its output folder.
 
     The finished map appears in the folder first, its scores and the report after them. Files of either appear together.
-    If the tracker has made further maps (`tracker.maps: all`), each is then mapped to a folder in the output folder.
+    Where the tracker has placed few images, they may be mapped anew with its second choice (`tracker.fallback`). If it
+    has made further maps (`tracker.maps: all`), each is then mapped to a folder in the output folder.
 
     Args:
         config: The scene's settings.
@@ -69,8 +72,22 @@ def run_scene(
             line = ProgressLine(console or Console(quiet=True), watch)
             held.callback(line.stop)
             run = open_run(config, line, held, resumed, replayed)
-            write_results(finish_map(map_stream(run, resumed)))
+            try:
+                stream = map_stream(run, resumed)
+            except NothingPlacedError:
+                better = better_tracker(config, run, 0)
+                if better is None:
+                    raise
+            else:
+                with stream.saving():
+                    better = better_tracker(config, run, len(stream.mapper.frames))
+                if better is None:
+                    write_results(finish_map(stream))
+                else:
+                    stream.keeper.remove()
             further = run.tracker.further_maps
+        if better is not None:
+            return run_scene(better, console, watch=watch)
         for place in range(2, 2 + further):
             line.note(f"map {place} of {1 + further}")
             run_scene(config.of_map(place), console, watch=watch)

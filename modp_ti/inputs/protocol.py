@@ -21,6 +21,11 @@ if TYPE_CHECKING:
 Event = TrackedFrame | PoseCorrection
 """What a tracker delivers: the next frame, or a correction of earlier ones."""
 
+
+class NothingPlacedError(InputError):
+    """A tracker of bare images could place none of them. Another tracker may."""
+
+
 Progress = Callable[[str, int, int], None]
 """Progress callback, called as progress(what, done, total) while a tracker prepares."""
 
@@ -114,6 +119,11 @@ class Tracker(ABC):
         It may shrink while the tracker finds images that it cannot place.
         """
         return None
+
+    @property
+    def unplaced(self) -> int:
+        """Number of images so far that a tracker of bare images could not place."""
+        return 0
 
     @property
     def scale(self) -> float:

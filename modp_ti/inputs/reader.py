@@ -55,6 +55,10 @@ class TrackerSettings(StrictModel):
     def open(self, scene: Scene, progress: Progress | None = None) -> Tracker:
         """Open the tracker of a scene whose `tracker` is this. See `modp_ti.open_tracker`."""
 
+    def second_choice(self, images: int) -> TrackerSettings | None:
+        """The tracker that is tried on a recording of so many images where this one places few; None for none."""
+        return None
+
     @classmethod
     def recognises(cls, tree: FileTree) -> bool:
         """Whether a folder or archive is such a recording. It must be cheap: it lists files at most."""

@@ -14,7 +14,7 @@ from modp_ti.inputs.klt.camera import WHILE_TRACKING, Lens, estimation_note
 from modp_ti.inputs.klt.delivered_trajectory import DeliveredTrajectory
 from modp_ti.inputs.klt.odometry import Odometry
 from modp_ti.inputs.klt.tracking import View
-from modp_ti.inputs.protocol import Event, LiveCounts, Progress, Tracker
+from modp_ti.inputs.protocol import Event, LiveCounts, NothingPlacedError, Progress, Tracker
 from modp_ti.inputs.replay import Unreadable, pictures_again, tracked_frame
 from modp_ti.inputs.sources import FrameReader, ImageSource, Intrinsics, Picture, Undistorter
 
@@ -148,6 +148,10 @@ class KltTracker(Tracker):
         return len(available(self._reader)) - self._skipped - (0 if arrivals is None else arrivals.thinned)
 
     @property
+    def unplaced(self) -> int:
+        return self._skipped
+
+    @property
     def further_maps(self) -> int:
         return max(0, self._odometry.places - 1) if self._further else 0
 
@@ -239,9 +243,11 @@ class KltTracker(Tracker):
         names, odometry, images = self._names, self._odometry, self._reader.images
         if self._trajectory is None:
             before = "" if images.ending is None else f" before the recording ended ({images.ending})"
-            raise InputError(
+            self._skipped = len(names)
+            raise NothingPlacedError(
                 f"{images.path}: klt could place none of the {len(names)} images{before}: {odometry.lacking}; "
-                "photographs in no order need tracker.kind=sfm"
+                "tracker.kind=sfm places photographs with wide steps or in no order; of a video, take more frames a "
+                "second"
             )
         if odometry.loops:
             yield f"klt closed {odometry.loops} loops"
@@ -256,7 +262,7 @@ class KltTracker(Tracker):
         if without:
             yield (
                 f"{len(without)} of {len(names)} images could not be placed (the first is {without[0]}): skipped; the "
-                f"camera was found again {odometry.recovered} times; photographs in no order need tracker.kind=sfm"
+                f"camera was found again {odometry.recovered} times; tracker.kind=sfm may place more of them"
             )
         apart = odometry.waiting
         if apart:

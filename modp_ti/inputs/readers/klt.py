@@ -12,6 +12,8 @@ from modp_ti.inputs.reader import TrackerSettings
 if TYPE_CHECKING:
     from modp_ti.inputs.source_settings import Scene
 
+MOST_FOR_SFM = 400
+
 
 class KltSettings(TrackerSettings):
     """The built-in tracker, which uses only the images."""
@@ -33,12 +35,24 @@ class KltSettings(TrackerSettings):
         "map of this place by size",
     )
 
+    fallback: Literal["sfm"] | None = Field(
+        default=None,
+        description=f"`sfm`: of a recording of at most {MOST_FOR_SFM} images of which less than 80 % could be placed, "
+        "structure from motion is tried, and if it places more, they are mapped anew with it. `modp-ti run` on a "
+        "recording sets it if no setting of `tracker` is given. Empty: none",
+    )
+
     @property
     def place(self) -> int | None:
         """Place by size of the map that is mapped; None for the first one."""
         if isinstance(self.maps, int):
             return self.maps
         return None if self.maps == "first" else 1
+
+    def second_choice(self, images: int) -> TrackerSettings | None:
+        from modp_ti.inputs.readers.sfm import SfmSettings
+
+        return SfmSettings() if self.fallback and images <= MOST_FOR_SFM else None
 
     def open(self, scene: Scene, progress: Progress | None = None) -> Tracker:
         """Open the tracker, in a process of its own where it keeps pace with its images."""

@@ -89,7 +89,7 @@ def _reconstruct(
     if model is None:
         raise InputError(
             f"{reader.images.path}: structure from motion could not join three of the {len(matched)} images: they need "
-            "to show one scene with detail, from places apart (tracker.kind: sfm)"
+            "to show one scene with detail, from places apart; frames of a video are for tracker.kind=klt"
         )
     folder.mkdir()
     model.write_binary(str(folder))

@@ -64,7 +64,8 @@ def refusal(*arguments: str) -> str:
 
 @pytest.mark.parametrize(("recording", "name"), [("room.mp4", "room"), ("hall", "hall"), ("hall/", "hall")])
 def test_a_recording_is_mapped_with_defaults_to_a_folder_of_its_name(folder, session, recording, name):
-    (folder / "scene.yaml").write_text(f"source: {{path: {recording}}}\ntracker: {{kind: klt}}\noutput: out/{name}\n")
+    tracker = "{kind: klt, fallback: sfm}"
+    (folder / "scene.yaml").write_text(f"source: {{path: {recording}}}\ntracker: {tracker}\noutput: out/{name}\n")
     assert mapped(session, recording) == load_scene(folder / "scene.yaml")
 
 
@@ -167,6 +168,20 @@ def test_poses_that_lie_in_the_folder_are_used_and_named(folder, file):
     assert len(said) == (config.tracker.kind != "klt")
     assert recorded_scene(folder / "room", ["tracker.kind=klt"]).tracker.kind == "klt"
     assert recorded_scene(folder / "room", ["tracker.maps=all"]).tracker.kind == "klt"
+
+
+def test_photographs_are_for_sfm_unless_a_tracker_is_named(folder):
+    (folder / "photos").mkdir()
+    Image.new("RGB", (64, 48)).save(folder / "photos/1.png")
+    Image.new("RGB", (48, 64)).save(folder / "photos/2.png")
+    said: list[str] = []
+    assert recorded_scene(folder / "photos", say=said.append).tracker.kind == "sfm"
+    assert len(said) == 1 and "tracker.kind=sfm" in said[0] and "tracker.kind=klt" in said[0]
+    for setting in ("tracker.kind=klt", "tracker.maps=all", "source.realtime=true", "source.stop=1"):
+        assert recorded_scene(folder / "photos", [setting]).tracker.kind == "klt"
+    assert recorded_scene(folder / "photos", ["tracker.kind=klt"]) == recorded_scene(
+        folder / "photos", ["tracker.kind=klt", "tracker.fallback=null"]
+    )
 
 
 @pytest.mark.parametrize(("name", "kind"), [("rgbd_dataset_freiburg1_xyz", "tum"), ("mine", "klt")])

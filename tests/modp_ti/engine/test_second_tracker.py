@@ -1,0 +1,94 @@
+"""A recording of which the first tracker places few images is mapped with the second one, if that places more."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from rich.console import Console
+
+from modp_ti.config.scene_file import load_scene
+from modp_ti.config.settings import SceneConfig
+from modp_ti.engine import second_tracker
+from modp_ti.engine.session import run_scene
+from modp_ti.files.errors import InputError
+from modp_ti.inputs.readers.klt import KltSettings
+from modp_ti.inputs.readers.sfm import SfmSettings
+from modp_ti.outputs.playback.finished_run import finished_metrics
+from tests.room import Room, RoomRecording, pinhole, walk
+
+CAMERA = pinhole(240, 180)
+# A few near views of a walk, and then far ones that come back to it from the other end of the room.
+RETURN = [*walk(10, step=0.04), *(walk(61, step=0.05)[i] for i in range(58, 5, -6))]
+# Views of two sides of the room in turn: none shows what the one before shows.
+BEHIND = np.diag([-1.0, 1.0, -1.0, 1.0])
+IN_TURN = [T for pose in walk(6, step=0.25) for T in (pose, BEHIND @ pose)]
+
+
+def scene(folder: Path, room: Room, poses: Sequence, tracker: str = "{kind: klt, fallback: sfm}") -> SceneConfig:
+    (folder / "images").mkdir(exist_ok=True)
+    for i, image in enumerate(RoomRecording(room, CAMERA, list(poses)).images):
+        cv2.imwrite(str(folder / "images" / f"{i:02d}.png"), image[..., ::-1])
+    (folder / "scene.yaml").write_text(f"""
+source:  {{path: images, scale: 0.5, intrinsics: {{fx: {CAMERA.fx}}}}}
+tracker: {tracker}
+output:  out
+device:  cpu
+mapping: {{optimise: {{steps: 1, last_passes: 0}}}}
+refine:  {{steps: 0}}
+export:  {{report: false}}
+""")
+    return load_scene(folder / "scene.yaml")
+
+
+def mapped(config: SceneConfig) -> tuple[str, int, str]:
+    """The tracker in the written settings, the frames of the map, and what was said."""
+    console = Console(file=io.StringIO(), width=1000)
+    output = run_scene(config, console)
+    written = load_scene(output / "config.yaml")
+    assert finished_metrics(config) is not None, "a batch does not repeat it"
+    frames = json.loads((output / "metrics.json").read_text())["frames"]
+    return written.tracker.kind, frames, console.file.getvalue()
+
+
+@pytest.mark.slow
+def test_the_tracker_that_places_more_makes_the_map(
+    room: Room, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = scene(tmp_path, room, RETURN)
+    kind, few, said = mapped(config)
+    assert kind == "klt" and 0.8 * len(RETURN) < few < len(RETURN), "the first one is good enough"
+    monkeypatch.setattr(second_tracker, "ENOUGH", 1.0)
+    kind, more, said = mapped(config)
+    assert kind == "sfm" and more > few
+    assert f"klt could place only {few} of {len(RETURN)}" in said and f"sfm places {more}" in said
+
+
+def test_only_a_recording_of_limited_length_has_a_second_choice() -> None:
+    assert KltSettings(fallback="sfm").second_choice(50) == SfmSettings()
+    assert KltSettings(fallback="sfm").second_choice(100_000) is None
+    assert KltSettings().second_choice(50) is None and SfmSettings().second_choice(50) is None
+
+
+@pytest.mark.slow
+def test_images_of_which_the_first_places_none_are_mapped_by_the_second(room: Room, tmp_path: Path) -> None:
+    kind, frames, _ = mapped(scene(tmp_path, room, IN_TURN))
+    assert kind == "sfm" and frames >= 5
+    with pytest.raises(InputError, match="klt could place none"):
+        run_scene(scene(tmp_path, room, IN_TURN, "{kind: klt}"))
+
+
+def test_where_neither_finds_anything_the_first_one_says_so(tmp_path: Path) -> None:
+    (tmp_path / "images").mkdir()
+    for i in range(4):
+        noise = np.random.default_rng(i).integers(0, 256, (60, 80, 3), dtype=np.uint8)
+        cv2.imwrite(str(tmp_path / "images" / f"{i}.png"), noise)
+    file = tmp_path / "scene.yaml"
+    file.write_text("source: {path: images}\ntracker: {kind: klt, fallback: sfm}\noutput: out\ndevice: cpu\n")
+    with pytest.raises(InputError, match="klt could place none of the 4 images"):
+        run_scene(load_scene(file))
