@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from modp_ti.inputs import steps
+from modp_ti.inputs.sources.image_folder import ImageFolder
 from modp_ti.inputs.steps import why_photographs
 from tests.room import Room, RoomRecording, look_at, pinhole, walk
 
@@ -53,6 +54,22 @@ def test_images_of_several_sizes_are_photographs(near: list[Path], tmp_path: Pat
     for name, other in (("small.png", image[:170]), ("turned.png", image.swapaxes(0, 1))):
         cv2.imwrite(str(tmp_path / name), other)
         assert why_photographs([*near[:3], tmp_path / name, *near[3:]]) is not None
+
+
+@pytest.mark.parametrize(
+    ("images", "photographs"),
+    [
+        ("clips/street", True),
+        ("courthouse/images", True),  # sfm places 285 of 286, klt 239
+        ("university/images", False),  # klt places 324 of 324
+        ("redkitchen/images", False),
+        ("desk/images", False),
+        ("fox/images", False),
+    ],
+)
+def test_recordings_go_to_the_tracker_that_places_more(shared_data, images: str, photographs: bool) -> None:
+    folder = ImageFolder(shared_data(images))
+    assert (why_photographs([folder.path / name for name in folder.names]) is not None) == photographs
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 3])
