@@ -4,12 +4,13 @@ The tables contain the time of a step by stage, its share of the machine's float
 the frames per second of whole runs. Every measurement runs in its own process. Figures are medians after a warm-up.
 
 With --quality, they contain instead the held-out PSNR of scenes against processor time at several budgets, by this
-version of the program and, with --against, by another one.
+version of the program and, with --against, by another one; with --minutes, that of maps made in so much time.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import subprocess
 import sys
@@ -62,14 +63,16 @@ def main() -> None:
         "--budgets", type=int, nargs="+", default=[1, 2, 4, 8, 25], metavar="STEPS", help="steps a keyframe of its runs"
     )
     options.add_argument("--runs", type=int, default=1, help="for --quality: runs of each, medians count (default 1)")
+    options.add_argument("--minutes", type=float, nargs="+", help="PSNR of `modp-ti run --minutes` with each of these")
     options.add_argument("--measure", help=argparse.SUPPRESS)
     arguments = options.parse_args()
     if arguments.measure:
         print(json.dumps(measure(**json.loads(arguments.measure))))
         return
     scenes = named_scenes(arguments.scene or [str(ROOT / "demo" / "scene.yaml")])
-    name = "quality" if arguments.quality else "benchmark"
-    text, figures = measure_quality(arguments, scenes) if arguments.quality else measure_speed(arguments, scenes)
+    name = "minutes" if arguments.minutes else "quality" if arguments.quality else "benchmark"
+    measures = {"minutes": measure_minutes, "quality": measure_quality, "benchmark": measure_speed}
+    text, figures = measures[name](arguments, scenes)
     print(text) if arguments.output is None else write_report(arguments.output, name, text, figures)
 
 
@@ -85,6 +88,15 @@ def measure_quality(arguments: argparse.Namespace, scenes: Mapping[str, Path]) -
         curves = quality.curves(scenes, versions, arguments.budgets, arguments.runs, settings)
     points = {scene: {v: [asdict(p) for p in points] for v, points in of.items()} for scene, of in curves.items()}
     return quality.report(curves), points
+
+
+def measure_minutes(arguments: argparse.Namespace, scenes: Mapping[str, Path]) -> tuple[str, Any]:
+    """Measure the quality of maps made in a given time, and return the table and its figures."""
+    settings = {"device": arguments.device, **command_line(arguments.set)}
+    for scene, minutes in itertools.product(scenes.values(), arguments.minutes):
+        settings_of(scene, Path("out"), {**settings, "minutes": minutes})  # reports bad settings before the first run
+    runs = quality.timed(scenes, arguments.minutes, settings)
+    return quality.timed_report(runs), runs
 
 
 def measure_speed(arguments: argparse.Namespace, scenes: Mapping[str, Path]) -> tuple[str, dict[str, Any]]:

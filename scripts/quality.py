@@ -1,4 +1,4 @@
-"""Held-out quality against processor time: runs of scenes at several budgets, by one version of the program or two."""
+"""Held-out quality against time: runs of scenes at several budgets, by one version of the program or two."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tables import Figures, mapping_seconds, markdown_table
+from tables import Figures, mapping_seconds, markdown_table, quality
+from versions import ROOT
 
 from modp_ti.files.errors import InputError
 
@@ -105,9 +106,14 @@ def curves(
 
 def measured(root: Path, scene: Path, steps: int, settings: Mapping[str, Any]) -> list[Point]:
     """Run a scene with the version in a folder, and return its points."""
+    fixed = {"threads": 1, "mapping.optimise.steps": steps, "refine.steps": REFINED * steps}
+    return points_of(*_run(root, scene, {**fixed, **settings}), steps)
+
+
+def _run(root: Path, scene: Path, settings: Mapping[str, Any]) -> tuple[dict[str, Any], float]:
+    """Run a scene with the version in a folder. Returns the content of metrics.json, and the processor time [s]."""
     with tempfile.TemporaryDirectory() as folder:
-        overrides = {"threads": 1, "mapping.optimise.steps": steps, "refine.steps": REFINED * steps}
-        overrides |= {"export.report": "false", **settings, "output": json.dumps(folder)}
+        overrides = {"export.report": "false", **settings, "output": json.dumps(folder)}
         command = [sys.executable, "-m", "modp_ti.run", str(scene)]
         command += [part for key, value in overrides.items() for part in ("--set", f"{key}={value}")]
         before = os.times()
@@ -118,7 +124,38 @@ def measured(root: Path, scene: Path, steps: int, settings: Mapping[str, Any]) -
         if done.returncode:
             raise InputError(f"the run of {scene} ended with exit code {done.returncode}")
         processor = after.children_user + after.children_system - before.children_user - before.children_system
-        return points_of(json.loads((Path(folder) / "metrics.json").read_text("utf-8")), processor, steps)
+        return json.loads((Path(folder) / "metrics.json").read_text("utf-8")), processor
+
+
+Timed = Mapping[str, Mapping[float, Mapping[str, float | None]]]
+"""PSNR [dB] and seconds from the start to the saved map, of runs by scene and minutes."""
+
+
+def timed(scenes: Mapping[str, Path], minutes: Sequence[float], settings: Mapping[str, Any]) -> Timed:
+    """Run every scene for so many minutes each, on all cores. Raises InputError if a run fails."""
+    result: dict[str, dict[float, Mapping[str, float | None]]] = {name: {} for name in scenes}
+    for name, scene in scenes.items():
+        for given in sorted(minutes):
+            print(f"{name}, {given:g} minutes ...", file=sys.stderr, flush=True)
+            metrics, _ = _run(ROOT, scene, {**settings, "minutes": given})
+            scores = quality(metrics["refined"] or metrics["online"])
+            result[name][given] = {"psnr": scores["psnr"], "seconds": metrics["timed"]["seconds_to_map"]}
+    return result
+
+
+def timed_report(runs: Timed) -> str:
+    """Return the table of `timed`."""
+    minutes = sorted({given for of in runs.values() for given in of})
+    late = max((of["seconds"] or 0.0) - 60.0 * given for by in runs.values() for given, of in by.items())
+    rows = {scene: {f"{given:g}": of["psnr"] for given, of in by.items()} for scene, by in runs.items()}
+    return "\n\n".join(
+        (
+            "# Quality after a given time",
+            "PSNR [dB] of `modp-ti run --minutes`, of the held-out frames, or of all where none is held out. The last "
+            f"map was in its folder {late:+.1f} s from its time.",
+            markdown_table("scene", {f"{given:g} min": (f"{given:g}", ".2f") for given in minutes}, rows),
+        )
+    )
 
 
 def points_of(metrics: Mapping[str, Any], processor: float, steps: int) -> list[Point]:

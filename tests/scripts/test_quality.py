@@ -89,3 +89,10 @@ def test_another_commit_is_checked_out_and_removed(tmp_path: Path, monkeypatch: 
     assert not other.exists()
     with pytest.raises(InputError, match="no such revision"), versions.checked_out("nowhere"):
         pass
+
+
+def test_the_table_of_a_given_time_has_the_last_map_of_each_run_and_how_late_it_was() -> None:
+    runs = {"room": {0.5: {"psnr": 20.0, "seconds": 29.0}, 3.0: {"psnr": 25.5, "seconds": 180.4}}}
+    text = quality.timed_report(runs | {"hall": {3.0: {"psnr": 22.25, "seconds": 170.0}}})
+    assert "| scene | 0.5 min | 3 min |" in text and "+0.4 s" in text
+    assert "| room | 20.00 | 25.50 |" in text and "| hall | – | 22.25 |" in text
