@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
 EXAMPLES = examples(
     "modp-ti run scene.yaml",
     "modp-ti run scene.yaml --fast   (a first look; --best for a map to keep)",
+    "modp-ti run scene.yaml --minutes 5   (the best map of so much time)",
     "modp-ti run scene.yaml --set source.scale=0.5 --set refine.steps=3000",
     "modp-ti run room.mp4 --fast   (or a folder of images; the map is in out/room)",
     "modp-ti run --stream 0 --view   (a camera; modp-ti cameras lists them)",
@@ -40,7 +42,7 @@ EXAMPLES = examples(
     "modp-ti run scene.yaml --parts 4   (by several processes; docs/scale.md)",
     "modp-ti run scene.yaml --set snapshot_every=50",
     "modp-ti run --resume OUT   (after a crash or Ctrl-C)",
-    "modp-ti run --replay OUT   (repeat a recorded realtime run)",
+    "modp-ti run --replay OUT   (repeat a recorded realtime or timed run)",
     "modp-ti run scene.yaml --quiet --json > result.json",
 )
 
@@ -70,7 +72,7 @@ def run(
     replay: Annotated[
         Path | None,
         typer.Option(
-            "--replay", metavar="OUT", help="repeat the realtime run whose output folder this is, from its session.zip"
+            "--replay", metavar="OUT", help="repeat the recorded run whose output folder this is, from its session.zip"
         ),
     ] = None,
     onto: Annotated[
@@ -89,6 +91,10 @@ def run(
         Where | None, typer.Option(help="of `--parts`: `local`, processes on this machine; `ray`, a Ray cluster")
     ] = None,
     address: Address = None,
+    minutes: Annotated[
+        float | None,
+        typer.Option("--minutes", help="the best map that so many minutes give on this machine, from now to its files"),
+    ] = None,
     fast: Fast = False,
     best: Best = False,
     force: Annotated[bool, typer.Option("--force", help="map even if the poses do not fit the images")] = False,
@@ -99,6 +105,7 @@ def run(
     more: Annotated[list[str] | None, typer.Argument(metavar="KEY=VALUE", hidden=True)] = None,
 ) -> None:
     """Map a recording or a stream while its frames arrive, and write splats, poses, metrics, pictures and a report."""
+    began = time.perf_counter()
     if scene is not None and "=" in scene.name and not scene.exists():  # `--stream 0 --set seed=1 source.stop=600`
         scene, more = None, [str(scene), *(more or [])]
     sources = [source for source in (scene, stream, resume, replay) if source is not None]
@@ -112,15 +119,21 @@ def run(
             raise InputError("one recording at a time: `modp-ti batch` maps several; of pictures, name their folder")
         if len(sources) > 1 and (stream is not None or replay is not None):
             raise InputError("--stream and --replay need no scene file and no --resume: give one of them")
-        settled = {"--onto": onto, "--parts": parts} | ({} if scene else {"--fast": fast, "--best": best})
+        settled = {"--onto": onto, "--parts": parts, "--minutes": minutes} | (
+            {} if scene else {"--fast": fast, "--best": best}
+        )
         for option, value in settled.items():
             if value and (resume is not None or replay is not None):
                 raise InputError(f"{option} is for a scene: a run that is resumed or repeated has its settings already")
+        if minutes is not None and (fast or best):
+            raise InputError("--minutes sets the steps by the clock: give it without --fast and --best")
         overrides = [*(["view.enabled=true"] * view), *(["force=true"] * force), *(set_ or []), *(more or [])]
         if onto is not None:
             overrides.append(f"onto={json.dumps(str(onto.expanduser().resolve()), ensure_ascii=False)}")
         if parts is not None:
             overrides.append(f"parts={parts}")
+        if minutes is not None:
+            overrides.append(f"minutes={minutes}")
         preset, console = chosen_preset(fast, best), progress_console(quiet)
         if task:
             from modp_ti.many.task import carry_out
@@ -130,7 +143,7 @@ def run(
             folder = _replay(replay, overrides, console)
         else:
             config, snapshot = _settings(scene, stream, resume, overrides, preset, console)
-            folder = _map(config, snapshot, engine, address, console)
+            folder = _map(config, snapshot, engine, address, console, began)
             if resume is not None:
                 from modp_ti.engine.resume import discard
 
@@ -173,7 +186,12 @@ def _settings(
 
 
 def _map(
-    config: SceneConfig, snapshot: Snapshot | None, engine: Where | None, address: str | None, console: Console
+    config: SceneConfig,
+    snapshot: Snapshot | None,
+    engine: Where | None,
+    address: str | None,
+    console: Console,
+    began: float,
 ) -> Path:
     """Map in this process, or in parts. Returns the output folder."""
     if config.parts is not None:
@@ -184,7 +202,7 @@ def _map(
         raise InputError("--engine and --address are for --parts, whose tasks they carry out")
     from modp_ti.engine.session import run_scene
 
-    return run_scene(config, console, snapshot)
+    return run_scene(config, console, snapshot, began=began)
 
 
 def _replay(recorded: Path, overrides: list[str], console: Console) -> Path:

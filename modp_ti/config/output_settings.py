@@ -32,8 +32,8 @@ class ExportSettings(StrictModel):
     )
     session: bool = Field(
         default=False,
-        description="write `session.zip`, all that arrived in a realtime run and what was decided by the clock, with "
-        "which `modp-ti run --replay OUT` repeats it exactly",
+        description="write `session.zip`, all that arrived in a realtime or timed run and what was decided by the "
+        "clock, with which `modp-ti run --replay OUT` repeats it exactly",
     )
     report: bool = Field(
         default=True, description="write `report.html`, a page with the metrics, plots, images and settings of the run"

@@ -56,6 +56,13 @@ EXCLUSIONS: tuple[tuple[str, tuple[str, ...], str], ...] = (
         "the faces of a panorama keep together, in one map",
     ),
     ("snapshot_every", ("mode: offline", *CLOCK), "a run resumes by reading its frames again; record them"),
+    ("minutes", ("mode: offline", *CLOCK), "it shares a time among the keyframes of a recording"),
+    (
+        "minutes",
+        ("onto", "parts", "source.part", "tracker.maps: all"),
+        "it is the time of one run, from the images to one map",
+    ),
+    ("minutes", ("refine.seconds",), "the refinement gets what the keyframes leave of it"),
     ("onto", ("mode: offline", *CLOCK), "frames wait while they are located in the finished map; record them"),
     ("onto", ("tracker.maps: all",), "one map is continued: set tracker.maps to first, largest or a number"),
     ("onto", ("parts",), "parts make a new map"),
@@ -99,6 +106,13 @@ class SceneConfig(StrictModel):
         ge=2,
         description="map the recording in so many parts, each in a separate process, and merge their maps "
         "(docs/scale.md). Empty: as one",
+    )
+    minutes: float | None = Field(
+        default=None,
+        gt=0,
+        description="make the best map that so many minutes give on this machine, from the start of the command to the "
+        "map in the output folder; scores and report come after. Sets the steps of the keyframes and of the refinement "
+        "by the clock, so that two runs differ (docs/method.md). Empty: the steps of the settings",
     )
     force: bool = Field(
         default=False, description="map even where given poses cannot be those of the images (`modp-ti check`)"
@@ -172,7 +186,8 @@ class SceneConfig(StrictModel):
     def can_be_resumed(self) -> bool:
         """Whether a run can resume from a snapshot. Snapshots do not contain the frames, which are read again."""
         one = self.mode == "online" and self.parts is None
-        return one and not (self.is_live or self.is_realtime or self.source.realtime)
+        whole = self.minutes is not None and self.export.session  # recorded from the first frame to the last
+        return one and not whole and not (self.is_live or self.is_realtime or self.source.realtime)
 
     def of_map(self, place: int) -> SceneConfig:
         """Return the settings of a run of its own for the map of this place by size, of tracker `klt`."""
@@ -222,6 +237,8 @@ def used_settings(scene: SceneConfig) -> dict[str, str]:
         "mapping.pace: realtime": scene.is_realtime,
         "mode: offline": scene.mode == "offline",
         "snapshot_every": bool(scene.snapshot_every),
+        "minutes": scene.minutes is not None,
+        "refine.seconds": scene.refine.seconds is not None,
         "onto": scene.onto is not None,
         "parts": scene.parts is not None,
     }

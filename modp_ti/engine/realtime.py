@@ -1,6 +1,7 @@
 """`RealtimeRun`: the clock of a realtime run, between the arriving frames, the pace and the mapper.
 
-`open_conductor` chooses between it, the repetition of a recorded session, and a run that knows no clock.
+`open_conductor` chooses between it, a run that ends at a given time, the repetition of a recorded session, and a run
+that knows no clock.
 """
 
 from __future__ import annotations
@@ -9,7 +10,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,9 +17,10 @@ import numpy as np
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
 from modp_ti.config.settings import SceneConfig
+from modp_ti.engine.clocked import ClockedRun, TimedRun
 from modp_ti.engine.interruption import Interruption
 from modp_ti.engine.mapper import Mapper
-from modp_ti.engine.recording import FILE, RecordedSession, ReplayedRun, SessionRecorder
+from modp_ti.engine.recording import RecordedSession, ReplayedRun, SessionRecorder
 from modp_ti.engine.stream import Conductor, FramesAhead
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.protocol import Event, LiveCounts, Tracker
@@ -27,40 +28,43 @@ from modp_ti.inputs.replay import ALL_HELD_OUT
 from modp_ti.outputs.progress import LiveStatus
 from pipelines.companions.pace import CompletePace, RealtimePace
 from pipelines.pipeline import FrameReport
-from pipelines.refinement import Schedule
-from pipelines.settings import MappingSettings, RefineSettings
+from pipelines.settings import MappingSettings
 
 # Time over which the shown rates are taken [s], and number of keyframes over which the shown steps are.
 RECENT, KEYFRAMES = 5.0, 10
 
 
-def open_conductor(config: SceneConfig, tracker: Tracker, held: ExitStack) -> Conductor:
-    """Return the conductor of a run: one that repeats a recorded session, follows the clock, or knows no clock.
+def open_conductor(config: SceneConfig, tracker: Tracker, held: ExitStack, clock: Callable[[], float]) -> Conductor:
+    """Return the conductor of a run: one that repeats a recorded session, follows a clock, or knows none.
 
     Args:
         config: The scene's settings.
         tracker: The tracker, or a recorded session.
         held: Closes the recording when the run ends.
+        clock: Returns the time that the run has taken so far [s].
 
     Raises:
         InputError: If the session cannot be recorded, or all frames are held out.
     """
     if isinstance(tracker, RecordedSession):
         return ReplayedRun(config.mapping, tracker)
-    if not config.is_realtime:
-        frames, every, views = tracker.frame_count, config.source.holdout, config.source.panorama.count
-        held_out = 0 if frames is None or every is None else -(-frames // (every * views)) * views
-        if frames and frames == held_out:
-            raise InputError(ALL_HELD_OUT)
-        return Conductor(CompletePace(config.mapping, None if frames is None else frames - held_out))
     recorder = None
-    if config.export.session:
+    if config.export.session and (config.is_realtime or config.minutes is not None):
         recorder = SessionRecorder()
         held.callback(recorder.close)
-    return RealtimeRun(config.mapping, tracker, recorder)
+    if config.is_realtime:
+        return RealtimeRun(config.mapping, tracker, recorder)
+    frames, every, views = tracker.frame_count, config.source.holdout, config.source.panorama.count
+    held_out = 0 if frames is None or every is None else -(-frames // (every * views)) * views
+    if frames and frames == held_out:
+        raise InputError(ALL_HELD_OUT)
+    mapped = None if frames is None else frames - held_out
+    if config.minutes is not None:
+        return TimedRun(config, mapped, recorder, clock)
+    return Conductor(CompletePace(config.mapping, mapped))
 
 
-class RealtimeRun(Conductor):
+class RealtimeRun(ClockedRun):
     """Keeps the mapper in step with the arriving frames.
 
     This object reads the clock. It tells the pace when frames arrive and what their work costs, and spends the time in
@@ -87,17 +91,15 @@ class RealtimeRun(Conductor):
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.pace: RealtimePace = RealtimePace(settings)
+        super().__init__(self.pace, recorder, clock)
         self.lag: list[float] = []
         self.waiting: list[int] = []
         self.steps: list[int] = []
         self.further = 0
         self._tracker = tracker
-        self._recorder = recorder
-        self._clock = clock
         self._ahead: FramesAhead[Event]
         self._done: float | None = None  # end of the previous event's work
         self._arrived: list[float] = []  # arrival of each frame
-        self._saved: float | None = None
         self._recent: deque[tuple[float, int, int]] = deque()  # newest arrival, frames arrived, frames tracked
 
     def events(
@@ -144,46 +146,27 @@ class RealtimeRun(Conductor):
         return True
 
     def add(self, mapper: Mapper, frame: TrackedFrame) -> FrameReport | None:
-        """Map a frame by the pace, and learn what it cost."""
-        if self._recorder is not None:
-            self._recorder.add_frame(frame)
         began = self._clock()
         arrived = began if frame.arrived is None else frame.arrived
         self._arrived.append(arrived)
         self.waiting.append(self._waiting())
         decisions = len(self.pace.decisions)
         self.pace.begin_frame(arrived, began)
-        before = dict(mapper.pipeline.stopwatch.seconds)
-        report = mapper.take(frame)
-        after = mapper.pipeline.stopwatch.seconds
+        report = super().add(mapper, frame)
         self._done = self._clock()
-        depth, optimise = (after.get(stage, 0.0) - before.get(stage, 0.0) for stage in ("depth", "optimise"))
-        steps = 0 if report is None else report.steps
-        self.pace.end_frame(self._done - began, depth, optimise, steps)
         self.lag.append(self._done - arrived)
         if len(self.pace.decisions) > decisions:
-            self.steps.append(steps)
+            self.steps.append(0 if report is None else report.steps)
         return report
 
     def correct(self, mapper: Mapper, correction: PoseCorrection) -> None:
         """Apply a correction, and count its time. If another one waits behind it, the Gaussians move with that one."""
-        more = isinstance(self._ahead.peek(), PoseCorrection)
-        if self._recorder is not None:
-            self._recorder.add_correction(correction, more)
-        mapper.correct(correction, more)
+        self._correct(mapper, correction, isinstance(self._ahead.peek(), PoseCorrection))
         self._count_aside()
         self._done = self._clock()
 
-    def schedule(self, settings: RefineSettings) -> Schedule | None:
-        schedule = super().schedule(settings)
-        return schedule if schedule is None or self._recorder is None else self._recorder.recorded(schedule)
-
-    def write_session(self, folder: Path, config: SceneConfig) -> None:
-        """Write the recorded session to a folder, if it was recorded."""
-        if self._recorder is not None:
-            costs = {kind: round(seconds, 5) for kind, seconds in self.pace.costs.known().items()}
-            about = {"settings": config.model_dump(mode="json"), "lag": self.lag, "costs": costs}
-            self._recorder.write(folder / FILE, self.pace.decisions, about)
+    def _about(self, config: SceneConfig) -> dict[str, Any]:
+        return {**super()._about(config), "lag": self.lag}
 
     def status(self) -> LiveStatus:
         """Return the recent figures."""
@@ -202,10 +185,6 @@ class RealtimeRun(Conductor):
             self._waiting(),
             float(np.mean(steps)) if steps else 0.0,
         )
-
-    def saved(self) -> list[str]:
-        self._saved = self._clock()
-        return [] if self._recorder is None or self._recorder.problem is None else [self._recorder.problem]
 
     def note(self) -> dict[str, Any]:
         return {"lag": self.lag[-1], "waiting": self.waiting[-1]}

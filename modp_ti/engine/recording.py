@@ -177,7 +177,8 @@ class RecordedSession(Tracker):
                 raise InputError(f"{self.path}: a session of version {about['version']}, this program reads {VERSION}")
             self.settings: dict[str, Any] = dict(about["settings"])
             self.plans = [
-                None if plan is None else Plan(float(plan[0]), int(plan[1]), int(plan[2])) for plan in about["plans"]
+                None if plan is None else Plan(float(plan[0]), int(plan[1]), None if plan[2] is None else int(plan[2]))
+                for plan in about["plans"]
             ]
             self.shares: list[float] | None = about["refinement"]
             self._events: list[dict[str, Any]] = about["events"]

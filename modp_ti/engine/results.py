@@ -7,7 +7,7 @@ import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -243,11 +243,16 @@ def remarks(pipeline: Pipeline) -> list[str]:
 
 
 class RunClock:
-    """Measures the time of the whole run (`total`) and of its mapping (`mapping`) [s], including earlier processes."""
+    """Measures the time of the whole run (`total`) and of its mapping (`mapping`) [s], including earlier processes.
 
-    def __init__(self, clock=time.perf_counter) -> None:
+    Args:
+        began: Time by the clock when the run began [s], None for now.
+        clock: Returns the time [s].
+    """
+
+    def __init__(self, began: float | None = None, clock: Callable[[], float] = time.perf_counter) -> None:
         self._clock = clock
-        self._began = clock()
+        self._began = clock() if began is None else began
         self._mapping_since: float | None = None
         self._before = self._mapped = 0.0
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
@@ -38,6 +39,7 @@ def run_scene(
     resumed: Snapshot | None = None,
     replayed: RecordedSession | None = None,
     watch: Callable[[StageProgress], None] | None = None,
+    began: float | None = None,
 ) -> Path:
     """Map a scene and write its output folder.
 
@@ -51,6 +53,7 @@ def run_scene(
         resumed: Snapshot to continue from, None to start from the first frame.
         replayed: Recorded session to repeat instead of opening the tracker, None for none.
         watch: Called with the progress of each stage whenever it changes, None for no calls.
+        began: `time.perf_counter()` when the user asked for the run, from which `minutes` counts [s]; None for now.
 
     Returns:
         The output folder.
@@ -66,12 +69,13 @@ def run_scene(
             output = modp_ti.run_scene(modp_ti.load_scene("scene.yaml"))
             print((output / "metrics.json").read_text())
     """
+    began = time.perf_counter() if began is None else began
     refuse_output_in_input(config, replayed=None if replayed is None else replayed.path)
     with run_folder(config.output, adopted=() if resumed is None else (FILE,)):
         with ExitStack() as held:
             line = ProgressLine(console or Console(quiet=True), watch)
             held.callback(line.stop)
-            run = open_run(config, line, held, resumed, replayed)
+            run = open_run(config, line, held, resumed, replayed, began)
             try:
                 stream = map_stream(run, resumed)
             except NothingPlacedError:
@@ -87,7 +91,7 @@ def run_scene(
                     stream.keeper.remove()
             further = run.tracker.further_maps
         if better is not None:
-            return run_scene(better, console, watch=watch)
+            return run_scene(better, console, watch=watch, began=began)
         for place in range(2, 2 + further):
             line.note(f"map {place} of {1 + further}")
             run_scene(config.of_map(place), console, watch=watch)

@@ -116,6 +116,7 @@ def open_run(
     held: ExitStack,
     resumed: Snapshot | None = None,
     replayed: RecordedSession | None = None,
+    began: float | None = None,
 ) -> OpenRun:
     """Start the engine and open the recording of a run.
 
@@ -125,11 +126,12 @@ def open_run(
         held: Closes the run's resources when it ends.
         resumed: Snapshot that the run continues from, None for a new run.
         replayed: Recorded session to repeat instead of opening the tracker, None for none.
+        began: `time.perf_counter()` when the run began [s], None for now.
 
     Raises:
         InputError: If the device or the input cannot be used.
     """
-    record, clock = RunRecord(), RunClock()
+    record, clock = RunRecord(), RunClock(began)
 
     def say(*notes: str) -> None:
         _say(line, record, *notes)
@@ -143,7 +145,7 @@ def open_run(
     record.device = describe(backend)
     line.note(f"device: {record.device}")
     say(*process.notes)
-    began = time.perf_counter()
+    tracking_since = time.perf_counter()
     stop = held.enter_context(Interruption(lambda: line.note("stopping after this step; Ctrl-C again stops at once")))
     if config.onto is not None:
         earlier: EarlierMap = SecondVisit(config, line)
@@ -158,9 +160,11 @@ def open_run(
         with line.working("checking the poses"):
             require_fitting(tracker)
     tracker = earlier.join(tracker)
-    conductor = open_conductor(config, tracker, held)
+    conductor = open_conductor(config, tracker, held, lambda: clock.total)
+    line.until = conductor.left
     run = OpenRun(
-        config, line, record, clock, backend, truth, observer, stop, earlier, tracker, recovery, conductor, began
+        *(config, line, record, clock, backend, truth, observer, stop, earlier, tracker, recovery, conductor),
+        began=tracking_since,
     )
     mapper = run.mapper_for(EXPECTED) if config.is_realtime else None  # while the tracker opens
     return replace(run, mapper=mapper, config=config.resolved(tracker.scale))
@@ -293,7 +297,7 @@ def _map(stream: MappedStream, arriving: FramesAhead[Event]) -> None:
             report = conductor.add(mapper, event)
             status = conductor.status()
             line.frame(report, tracker.frame_count, status)
-            # A realtime run has no time for the PSNR of new keyframes.
+            # A run that follows a clock has no time for the PSNR of new keyframes.
             scores = config.evaluation.scores and isinstance(conductor.pace, CompletePace)
             run.record.frame(event.index, report, mapped_psnr(pipeline, report) if scores else None, **conductor.note())
             run.observer.on_frame(event, report, status)
@@ -363,7 +367,8 @@ def finish_map(stream: MappedStream) -> FinishedMap:
             keeper.after_mapping()
             keeper.online = versions[config.mode]
             settings = run.earlier.refinement(config.refine)
-            steps = settings.steps if settings.seconds is None else None
+            schedule = run.conductor.schedule(settings)
+            steps = settings.steps if schedule is None else None
             scores = stream.later.scores(len(mapper.frames)) / settings.views  # in steps
 
             def after_step(step: int, psnr: float) -> None:
@@ -373,7 +378,7 @@ def finish_map(stream: MappedStream) -> FinishedMap:
 
             line.start("refining", steps, keeper.refined, lambda step: step * scores)
             try:
-                mapper.refine(settings.steps, settings, after_step, keeper.refined, run.conductor.schedule(settings))
+                mapper.refine(settings.steps, settings, after_step, keeper.refined, schedule)
             finally:
                 line.stop()
             versions["refined"] = mapper.version()

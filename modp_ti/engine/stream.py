@@ -187,6 +187,10 @@ class Conductor:
         """Return the recent figures of a realtime run, None for other runs."""
         return None
 
+    def left(self) -> float | None:
+        """Return the time until the map is to be in the output folder [s], None where there is no such time."""
+        return None
+
     def note(self) -> dict[str, Any]:
         """Return what `RunRecord.frame` notes of the last frame in a realtime run."""
         return {}
@@ -204,7 +208,7 @@ class Conductor:
         return []
 
     def metrics(self) -> dict[str, Any]:
-        """Return the entries of `metrics.json` about a realtime run."""
+        """Return the entries of `metrics.json` about a run that followed a clock."""
         return {}
 
 

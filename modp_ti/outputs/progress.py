@@ -228,10 +228,15 @@ class ProgressLine:
     Args:
         console: Where it is shown.
         watch: Called with the progress whenever it changes.
+
+    Attributes:
+        until: Returns the time left of a run that ends at a given time [s], which is shown instead of an estimate; None
+            where there is no such time.
     """
 
     def __init__(self, console: Console, watch: Callable[[StageProgress], None] | None = None) -> None:
         self.console = console
+        self.until: Callable[[], float | None] = lambda: None
         self._watch = watch
         self._progress: Progress | None = None
         self._state = ""
@@ -371,7 +376,10 @@ class ProgressLine:
         self._left.update(done)
         left, pace = self._left.seconds(), self._left.pace()
         later = None if left is None or pace is None or task.finished else self._later(pace)
-        text = "" if left is None or later is None else f"  {duration(left + later)} left"
+        whole = None if left is None or later is None else left + later
+        if (until := self.until()) is not None:
+            whole = max(until, 0.0)
+        text = "" if whole is None else f"  {duration(whole)} left"
         self._progress.update(task.id, left=text)
         progress = StageProgress(task.description, done, total, task.fields["state"], text)
         if self._watch is not None:

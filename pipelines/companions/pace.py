@@ -124,6 +124,52 @@ class Costs:
         return dict(self._mean)
 
 
+class LearningPace(Pace):
+    """Base of the paces that follow a clock: is told what the work has cost, and keeps the decisions.
+
+    Args:
+        settings: Settings of the mapping.
+
+    Attributes:
+        costs: The measured costs.
+        decisions: The decisions so far, for `RecordedPace`.
+    """
+
+    def __init__(self, settings: MappingSettings) -> None:
+        self._settings = settings
+        self.costs = Costs()
+        self.decisions: list[Plan | None] = []
+        self._planned: tuple[Plan, int] | None = None  # plan and level of the current frame's keyframe
+        self._aside = 0.0  # time of other work since the last keyframe
+
+    def end_frame(self, seconds: float, depth: float = 0.0, optimise: float = 0.0, steps: int = 0) -> None:
+        """Called after each frame with the times that it took.
+
+        Args:
+            seconds: Time of the whole frame [s].
+            depth: Time of the depth at high-error pixels [s].
+            optimise: Time of the optimisation steps [s].
+            steps: Their number.
+        """
+        planned, self._planned = self._planned, None
+        if planned is None:
+            self._aside += seconds
+            return
+        plan, level = planned
+        if plan.pixels > 0 and depth > 0:
+            self.costs.learn(f"depth {level}", depth / _share_of_depth(plan.pixels))
+        if steps:
+            self.costs.learn(f"step {level}", optimise / steps)
+        self.costs.learn("keyframe", seconds - depth - (optimise if steps else 0.0))
+
+    def steps_after_correction(self, keyframes: int, frames: int) -> int:
+        """Return 0: the ordinary steps mend the seams, by the same clock as everything else."""
+        return 0
+
+    def last_views(self, keyframes: int) -> int:
+        return bounded_last_views(self._settings.optimise, keyframes)
+
+
 # Lag at the start of a keyframe that the pace holds, as a share of `max_lag`, and share of a deviation from it that is
 # made up for within one keyframe. A share between 0 and 1 lets the lag approach the goal without oscillating.
 GOAL = 0.25
@@ -148,7 +194,7 @@ SWEPT = 3
 WEIGHT = 0.2
 
 
-class RealtimePace:
+class RealtimePace(LearningPace):
     """Gives every keyframe the work that fits into the time until the next one.
 
     The pace never reads a clock. It is told when each frame arrived, when the mapper began with it, and what the work
@@ -173,26 +219,20 @@ class RealtimePace:
         settings: Settings of the mapping.
 
     Attributes:
-        costs: The measured costs.
         lag: Time from the arrival of the current frame to the start of its work [s].
-        decisions: The decisions so far, for `RecordedPace`.
         merged: Number of merged keyframes.
         skipped: Number of skipped keyframes.
     """
 
     def __init__(self, settings: MappingSettings) -> None:
-        self._settings = settings
+        super().__init__(settings)
         self.max_lag = settings.max_lag
         self.most_steps = settings.optimise.steps
-        self.costs = Costs()
         self.lag = 0.0
-        self.decisions: list[Plan | None] = []
         self.merged = self.skipped = 0
         self._arrived = 0.0
-        self._planned: tuple[Plan, int] | None = None  # plan and level of the current frame's keyframe
         self._interval = 0.5 * settings.max_lag
         self._last_keyframe: float | None = None  # arrival of the last frame that should have become a keyframe
-        self._aside = 0.0  # time of other work since then
         self._saved = 0.0  # time of skipped and merged keyframes that nothing else has used [s]
         self._late = 0.0  # time since the last kept keyframe, while the lag is beyond `max_lag` [s]
 
@@ -201,27 +241,7 @@ class RealtimePace:
     def begin_frame(self, arrived: float, now: float) -> None:
         """Called before each frame with the time at which it arrived, and the present time on the same clock [s]."""
         self._arrived = arrived
-        self._planned = None
         self.lag = max(0.0, now - arrived)
-
-    def end_frame(self, seconds: float, depth: float = 0.0, optimise: float = 0.0, steps: int = 0) -> None:
-        """Called after each frame with the times that it took.
-
-        Args:
-            seconds: Time of the whole frame [s].
-            depth: Time of the depth at high-error pixels [s].
-            optimise: Time of the optimisation steps [s].
-            steps: Their number.
-        """
-        if self._planned is None:
-            self._aside += seconds
-            return
-        plan, level = self._planned
-        if plan.pixels > 0 and depth > 0:
-            self.costs.learn(f"depth {level}", depth / _share_of_depth(plan.pixels))
-        if steps:
-            self.costs.learn(f"step {level}", optimise / steps)
-        self.costs.learn("keyframe", seconds - depth - (optimise if steps else 0.0))
 
     def spend_aside(self, seconds: float) -> None:
         """Count time that something other than frames took, such as a correction [s]."""
@@ -256,13 +276,6 @@ class RealtimePace:
             self._saved = 0.0
         self.decisions.append(plan)
         return plan
-
-    def steps_after_correction(self, keyframes: int, frames: int) -> int:
-        """Return 0: the ordinary steps mend the seams, by the same clock as everything else."""
-        return 0
-
-    def last_views(self, keyframes: int) -> int:
-        return bounded_last_views(self._settings.optimise, keyframes)
 
     def _note_interval(self) -> None:
         if self._last_keyframe is not None:

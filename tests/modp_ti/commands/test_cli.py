@@ -40,7 +40,7 @@ def session(monkeypatch):
     """Stands in for the mapping session: opens the tracker and keeps its configurations, or raises `failing`."""
     configs = []
 
-    def run_scene(config, console, resumed=None):
+    def run_scene(config, console, resumed=None, began=None):
         if module.failing is not None:
             raise module.failing
         configs.append(config)
@@ -191,7 +191,7 @@ def test_a_fault_of_the_program_has_a_traceback_and_its_own_code(scene, session)
 def test_ctrl_c_ends_a_real_process_with_130_and_leaves_nothing(scene):
     code = (
         "import os, sys, types, time; sys.argv[0] = 'modp-ti'; module = types.ModuleType('modp_ti.engine.session')\n"
-        "def run_scene(config, console, resumed=None):\n"
+        "def run_scene(config, console, resumed=None, began=None):\n"
         "    config.output.with_name('out.partial').mkdir()\n"
         "    try: os.write(1, b'begun\\n'); time.sleep(60)\n"
         "    finally: config.output.with_name('out.partial').rmdir()\n"

@@ -31,7 +31,7 @@ def session(monkeypatch):
     """Stands in for the mapping session: keeps its configurations, and writes what tells a run's recording."""
     configs = []
 
-    def run_scene(config, console, resumed=None):
+    def run_scene(config, console, resumed=None, began=None):
         configs.append(config)
         config.output.mkdir(parents=True, exist_ok=True)
         dump_scene(config, config.output / "config.yaml")

@@ -298,6 +298,8 @@ WAYS = {
     "mapping.pace: realtime": "mapping.pace=realtime",
     "mode: offline": "mode=offline",
     "snapshot_every": "snapshot_every=9",
+    "minutes": "minutes=1",
+    "refine.seconds": "refine.seconds=9",
     "onto": "onto=first",
     "parts": "parts=2",
 }
