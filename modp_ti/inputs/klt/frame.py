@@ -8,7 +8,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from modp_ti.inputs.multiview.features import FLOW_WINDOW, Features, detect_features, flow_there_and_back
+from modp_ti.inputs.multiview.features import (
+    FLOW_WINDOW,
+    Features,
+    detect_features,
+    flow_there_and_back,
+    match_anywhere,
+)
 
 WANTED = 450  # features that are tracked
 DESCRIBED_SIDE = 400  # longer side at which SIFT features are detected: 60 % of the time that 640 px take
@@ -18,6 +24,7 @@ LEVELS = 4  # pyramid levels above the image itself, at most
 SLOW = 12.0
 SLOW_LEVELS, RETURN_LEVELS = 2, 1
 PREDICTED_SHARE = 0.85
+FEWEST_MATCHES, MATCH_ERROR = 15, 8.0  # matches that fit a homography, and their error [px]
 # Largest forward-backward error [px].
 ROUND_TRIP = 0.7
 # Smallest minimum eigenvalue of a corner's structure tensor, as a share of the best corner's.
@@ -66,6 +73,17 @@ class Frame:
         """
         pixels, found = flow(other.grey, self.grey, other.pixels, guess)
         self.ids, self.pixels = other.ids[found], pixels[found]
+
+    def track_by_matches(self, other: Frame) -> None:
+        """As `track`, from where the homography that fits most SIFT matches expects the features; none without one."""
+        a, b = other.described, self.described
+        pairs = match_anywhere(a, b)
+        self.ids, self.pixels = self.ids[:0], self.pixels[:0]
+        if len(pairs) < FEWEST_MATCHES or len(other.pixels) == 0:
+            return
+        found, fits = cv2.findHomography(a.pixels[pairs[:, 0]], b.pixels[pairs[:, 1]], cv2.RANSAC, MATCH_ERROR)
+        if found is not None and fits.sum() >= FEWEST_MATCHES:
+            self.track(other, np.asarray(cv2.perspectiveTransform(other.pixels[:, None], found)[:, 0], np.float64))
 
     def append(self, ids: NDArray[np.int64], pixels: NDArray[np.float64]) -> None:
         """Add features (M,) at pixels (M, 2), except those that the frame already has."""
@@ -140,15 +158,22 @@ def _flow(
 
 
 def _lit_alike(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Match brightness and contrast of `before` to `after`, since flow mistakes exposure changes for motion."""
+    """Match brightness and contrast of `before` to `after`, since flow mistakes exposure changes for motion.
+
+    Where the contrast changes by a factor of two or more, the histogram is matched.
+    """
     gains = _gains_of_rows(before, after)
     if gains is not None:
         return np.clip(np.rint(before * gains[:, None]), 0, 255).astype(np.uint8)
     (mean,), (deviation,) = (each.ravel() for each in cv2.meanStdDev(before))
     (mean_after,), (deviation_after,) = (each.ravel() for each in cv2.meanStdDev(after))
     gain = float(deviation_after / max(deviation, 1e-6))
-    if not 0.5 < gain < 2.0 or (abs(gain - 1.0) < 0.02 and abs(mean - mean_after) < 2.0):
+    if abs(gain - 1.0) < 0.02 and abs(mean - mean_after) < 2.0:
         return before
+    if not 0.5 < gain < 2.0:  # values may be cut off at black or white
+        rank, rank_after = (np.cumsum(np.bincount(each.ravel(), minlength=256)) for each in (before, after))
+        levels = np.clip(np.searchsorted(rank_after, rank), 0, 255).astype(np.uint8)
+        return np.asarray(cv2.LUT(before, levels), dtype=np.uint8)
     return np.asarray(cv2.convertScaleAbs(before, alpha=gain, beta=float(mean_after - gain * mean)), dtype=np.uint8)
 
 

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from modp_ti.inputs.klt.camera import Lens
 from modp_ti.inputs.klt.frame import WANTED, Frame
 from modp_ti.inputs.klt.landmark_map import LandmarkMap, triangulated
-from modp_ti.inputs.multiview.features import match_anywhere
 from modp_ti.inputs.multiview.reprojection import estimated, pose_from_points, ray_errors
 
 FEWEST_SHARED = 60  # features that two views must share
@@ -20,6 +19,7 @@ MOVING, LEAST_SHIFT = 0.25, 0.005
 LEAST_ANGLE = 2.3
 PATIENCE = 60  # frames
 FAR = 0.5  # degrees of parallax below which a feature has no depth, but agrees with the motion
+LONGEST_GAP = 30  # frames over which features are matched
 BETWEEN = 3  # keyframes between the two views
 LONGEST = 400  # frames in memory
 MAX_ERROR = 1.5  # px, RANSAC threshold
@@ -56,6 +56,7 @@ class Initialisation:
         self._lens = lens
         self._seed = seed
         self._count = 0
+        self._before: Frame | None = None  # the frame before a gap
 
     def add(self, frame: Frame, attempts: bool = True) -> LandmarkMap | None:
         """Add a frame without features. It is given those of the frame before, and new ones.
@@ -70,18 +71,27 @@ class Initialisation:
         if self.frames:
             last = self.frames[-1]
             frame.track(last)
-            if len(frame.ids) < max(FEWEST_SHARED, 0.35 * len(last.ids)) <= len(last.ids):  # flow has lost too many
-                a, b = last.described, frame.described
-                pairs = match_anywhere(a, b)
-                ids = self._new_ids(len(pairs))
-                last.append(ids, a.pixels[pairs[:, 0]])
-                frame.append(ids, b.pixels[pairs[:, 1]])
+            if len(frame.ids) < max(FEWEST_SHARED, 0.35 * len(last.ids)):  # flow has lost too many
+                self._bridge(frame, last)
         self.frames = [*self.frames, frame][-LONGEST:]
         found = self._attempt(frame) if attempts else None
         if len(frame.ids) < 0.75 * WANTED:
             new = frame.new_corners()
             frame.append(self._new_ids(len(new)), new)
         return found
+
+    def _bridge(self, frame: Frame, last: Frame) -> None:
+        """Track features by matches from the last frame, or the one before a gap, whose frames are then dropped."""
+        if self._before is None or frame.number - self._before.number > LONGEST_GAP:
+            self._before = last
+        for other in (last, self._before):
+            if len(other.ids) < FEWEST_SHARED:
+                continue
+            frame.track_by_matches(other)
+            if len(frame.ids) >= FEWEST_SHARED:
+                self.frames = [each for each in self.frames if each.number <= other.number]
+                self._before = None
+                return
 
     def _new_ids(self, count: int) -> NDArray[np.int64]:
         self._count += count

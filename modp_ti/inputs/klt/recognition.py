@@ -45,7 +45,12 @@ def thumbnail(grey: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 
 def place_by_features(
-    landmarks: LandmarkMap, keyframe: Keyframe, features: Features, seed: int, assumed: bool = False
+    landmarks: LandmarkMap,
+    keyframe: Keyframe,
+    features: Features,
+    pairs: NDArray[np.int64],
+    seed: int,
+    assumed: bool = False,
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]] | None:
     """Localise a frame by SIFT matches with a keyframe.
 
@@ -53,14 +58,13 @@ def place_by_features(
         landmarks: The map.
         keyframe: One of its keyframes.
         features: SIFT features of the frame.
+        pairs: (M, 2) matches of both: indices of SIFT features in the keyframe and in the frame.
         seed: Seed of RANSAC.
         assumed: Whether features count whose depth is not certain; then more must agree.
 
     Returns:
-        T_camera_world (4, 4) of the frame, and the matches (M, 2) that agree: indices of SIFT features in the keyframe
-        and in the frame. None if too few agree.
+        T_camera_world (4, 4) of the frame, and the matches (N, 2) that agree. None if too few agree.
     """
-    pairs = match_anywhere(keyframe.described, features)
     if len(pairs) < FEWEST:
         return None
     xyz = world_points(landmarks, keyframe, assumed)[pairs[:, 0]]
@@ -225,7 +229,7 @@ def recognised(landmarks: LandmarkMap, of: Keyframe, own: LandmarkMap, by: Keyfr
         by: Another keyframe.
         seed: Seed of RANSAC.
     """
-    placed = place_by_features(landmarks, of, by.described, seed)
+    placed = place_by_features(landmarks, of, by.described, match_anywhere(of.described, by.described), seed)
     if placed is None:
         return None
     T, pairs = placed

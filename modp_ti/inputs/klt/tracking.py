@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,7 @@ from modp_ti.inputs.klt.landmark_map import LandmarkMap
 from modp_ti.inputs.klt.localisation import FEWEST, SIGMA, localised, predicted_pixels, realigned, searched
 from modp_ti.inputs.klt.recognition import inherited, place_by_features, thumbnail, world_points
 from modp_ti.inputs.multiview.bundle_adjustment import Refinable
+from modp_ti.inputs.multiview.features import match_anywhere
 from modp_ti.inputs.multiview.reprojection import refine_pose
 
 # A frame becomes a keyframe if the features have moved by KEYFRAME_SHIFT of the image's longer side since the last
@@ -368,10 +370,10 @@ class Tracking:
 
         If none does, depths are assumed where they are not known.
         """
-        candidates = list(candidates)
-        for k, assumed in [*((k, False) for k in candidates), *((k, True) for k in candidates)]:
+        matches = {k: match_anywhere(self.map.keyframes[k].described, frame.described) for k in candidates}
+        for assumed, (k, pairs) in product((False, True), matches.items()):
             keyframe = self.map.keyframes[k]
-            placed = place_by_features(self.map, keyframe, frame.described, self._seed, assumed)
+            placed = place_by_features(self.map, keyframe, frame.described, pairs, self._seed, assumed)
             if placed is None:
                 continue
             T, pairs = placed

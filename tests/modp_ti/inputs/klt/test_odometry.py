@@ -72,6 +72,18 @@ def light_that_changes(room: BoxRoom, walk: Walk) -> Sequence:
     return [lit(grey, 0.8 + 0.3 * np.sin(i / 4)) for i, grey in enumerate(walk.grey)], [*walk.poses]
 
 
+@sequence(0.02)
+def four_times_less_light_from_one_frame_to_the_next(room: BoxRoom, walk: Walk) -> Sequence:
+    return [lit(grey, 0.25 if 30 <= i < 40 else 1.0) for i, grey in enumerate(walk.grey)], [*walk.poses]
+
+
+@sequence(0.02)
+def black_frames_before_the_map_has_begun(room: BoxRoom, walk: Walk) -> Sequence:
+    dark = range(4, 8)
+    greys = [BLACK if i in dark else grey for i, grey in enumerate(walk.grey[:35])]
+    return greys, [None if i in dark else T for i, T in enumerate(walk.poses[:35])]
+
+
 @sequence(0.03)
 def bands_of_light_that_wander_over_the_rows(room: BoxRoom, walk: Walk) -> Sequence:
     rows = np.arange(240)[:, None] / 100.0
