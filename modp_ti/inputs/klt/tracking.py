@@ -370,10 +370,12 @@ class Tracking:
 
         If none does, depths are assumed where they are not known.
         """
-        matches = {k: match_anywhere(self.map.keyframes[k].described, frame.described) for k in candidates}
-        for assumed, (k, pairs) in product((False, True), matches.items()):
+        matches: dict[int, NDArray[np.int64]] = {}
+        for assumed, k in product((False, True), candidates):
             keyframe = self.map.keyframes[k]
-            placed = place_by_features(self.map, keyframe, frame.described, pairs, self._seed, assumed)
+            if k not in matches:
+                matches[k] = match_anywhere(keyframe.described, frame.described)
+            placed = place_by_features(self.map, keyframe, frame.described, matches[k], self._seed, assumed)
             if placed is None:
                 continue
             T, pairs = placed

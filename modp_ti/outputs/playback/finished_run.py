@@ -182,7 +182,8 @@ def finished_metrics(config: SceneConfig) -> dict[str, Any] | None:
 
 def made_with(written: SceneConfig, config: SceneConfig) -> bool:
     """Whether the settings that a run has written are these, as far as its map depends on them."""
-    if getattr(config.tracker, "fallback", None) == written.tracker.kind:  # the run took its second choice
+    second = config.tracker.second_choice(0)
+    if second is not None and second.kind == written.tracker.kind:  # the run took it
         config = config.model_copy(update={"tracker": written.tracker})
     scale = written.source.scale
     if scale != "auto":  # the run's number, which `auto` in the scene file became
