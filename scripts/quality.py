@@ -175,8 +175,8 @@ def points_of(metrics: Mapping[str, Any], processor: float, steps: int) -> list[
             seconds = processor * seconds / metrics["seconds"]["total"]
             of, fitted = scores["held_out"], scores.get("fitted", {}).get("psnr")
             retained = (metrics.get("retention") or {}).get(stage, {}).get("worst")
-            quality = of["psnr"], of["ssim"], of.get("detail"), fitted, retained
-            points.append(Point(steps, stage, seconds, *quality, scores["gaussians"], scores["view_renders"]))
+            values = of["psnr"], of["ssim"], of.get("detail"), fitted, retained
+            points.append(Point(steps, stage, seconds, *values, scores["gaussians"], scores["view_renders"]))
     return points
 
 

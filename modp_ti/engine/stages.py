@@ -145,7 +145,7 @@ def open_run(
     record.device = describe(backend)
     line.note(f"device: {record.device}")
     say(*process.notes)
-    tracking_since = time.perf_counter()
+    since = time.perf_counter()
     stop = held.enter_context(Interruption(lambda: line.note("stopping after this step; Ctrl-C again stops at once")))
     if config.onto is not None:
         earlier: EarlierMap = SecondVisit(config, line)
@@ -163,8 +163,7 @@ def open_run(
     conductor = open_conductor(config, tracker, held, lambda: clock.total)
     line.until = conductor.left
     run = OpenRun(
-        *(config, line, record, clock, backend, truth, observer, stop, earlier, tracker, recovery, conductor),
-        began=tracking_since,
+        config, line, record, clock, backend, truth, observer, stop, earlier, tracker, recovery, conductor, since
     )
     mapper = run.mapper_for(EXPECTED) if config.is_realtime else None  # while the tracker opens
     return replace(run, mapper=mapper, config=config.resolved(tracker.scale))
