@@ -56,8 +56,8 @@ EXAMPLES = {
 PATH_NAMES = ("recorded", "smoothed", "orbit")
 # fmt: off
 Format = Literal[
-    "points", "mesh", "splat", "spz", "sog", "sog-lod", "compressed-ply", "splat-glb", "html", "colmap", "nerfstudio",
-    "video",
+    "points", "mesh", "splat", "spz", "sog", "sog-lod", "compressed-ply", "splat-glb", "usd", "html", "colmap",
+    "nerfstudio", "video",
 ]
 # fmt: on
 NOT_FOUND = 1
@@ -143,8 +143,9 @@ def export(
             "-f",
             help="`html`: a page that shows the map in any browser, without network; `points`: coloured points (PLY); "
             "`mesh`: surface with colours (PLY, GLB, OBJ); `splat`, `spz`, `sog`, `compressed-ply`, `splat-glb`: "
-            "splats for viewers; `sog-lod`: a folder to serve, of which a browser loads what it shows; `colmap`, "
-            "`nerfstudio`: images with poses and points, to train on; `video`: the path",
+            "splats for viewers; `usd`: splats in OpenUSD (needs the extra `usd`); `sog-lod`: a folder to serve, of "
+            "which a browser loads what it shows; `colmap`, `nerfstudio`: images with poses and points, to train on; "
+            "`video`: the path",
         ),
     ],
     output: Annotated[

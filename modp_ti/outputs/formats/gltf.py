@@ -137,21 +137,17 @@ def write_splat_glb(path: str | os.PathLike[str], state: Mapping[str, NDArray]) 
         path: The file.
         state: Gaussians by name, as from `GaussianField.to_numpy`.
     """
-    w, x, y, z = unit_quaternions(state).T
-    constant = state["sh"][:, 0].astype(np.float64)
-    rgba = np.column_stack([_linear(np.clip(0.5 + SH_C0 * constant, 0, 1)), opacities(state)])
+    position, quaternion, scale, opacity, sh = upright_splats(state)
+    rgba = np.column_stack([_linear(np.clip(0.5 + SH_C0 * sh[:, 0], 0, 1)), opacity])
     attributes: dict[str, NDArray] = {
-        "POSITION": state["position"].astype(np.float64) * HALF_TURN,
-        # Half a turn around x is the quaternion (0, 1, 0, 0), which multiplies from the left.
-        f"{SPLATS}:ROTATION": np.column_stack([w, -z, y, -x]),
-        f"{SPLATS}:SCALE": np.exp(state["log_scale"].astype(np.float64)),
-        f"{SPLATS}:OPACITY": opacities(state),
-        f"{SPLATS}:SH_DEGREE_0_COEF_0": constant,
+        "POSITION": position,
+        f"{SPLATS}:ROTATION": quaternion,
+        f"{SPLATS}:SCALE": scale,
+        f"{SPLATS}:OPACITY": opacity,
     }
-    for k in range(1, state["sh"].shape[1]):
+    for k in range(sh.shape[1]):
         degree = int(k**0.5)
-        name = f"{SPLATS}:SH_DEGREE_{degree}_COEF_{k - degree * degree}"
-        attributes[name] = state["sh"][:, k].astype(np.float64) * TURNED[k - 1]
+        attributes[f"{SPLATS}:SH_DEGREE_{degree}_COEF_{k - degree * degree}"] = sh[:, k]
     buffer = _Buffer()
     numbers = {name: buffer.add(v.astype(np.float32), bounds=name == "POSITION") for name, v in attributes.items()}
     numbers["COLOR_0"] = buffer.add(to_bits(rgba, 8).astype(np.uint8))
@@ -162,6 +158,23 @@ def write_splat_glb(path: str | os.PathLike[str], state: Mapping[str, NDArray]) 
         "sortingMethod": "cameraDistance",
     }
     buffer.write(path, SPLATS, {"attributes": numbers, "mode": POINTS, "extensions": {SPLATS: about}})
+
+
+def upright_splats(state: Mapping[str, NDArray]) -> tuple[NDArray[np.float64], ...]:
+    """Return Gaussians turned by 180 degrees around x, so that the y axis is up.
+
+    Args:
+        state: Gaussians by name, as from `GaussianField.to_numpy`.
+
+    Returns:
+        Positions (N, 3), unit quaternions (N, 4) as x, y, z, w, linear scales (N, 3), opacities (N,), SH (N, K, 3).
+    """
+    w, x, y, z = unit_quaternions(state).T
+    # Half a turn around x is the quaternion (0, 1, 0, 0), w first, which multiplies from the left.
+    quaternion = np.column_stack([w, -z, y, -x])
+    sh = state["sh"] * np.concatenate([[1.0], TURNED])[: state["sh"].shape[1], None]
+    scale = np.exp(state["log_scale"].astype(np.float64))
+    return state["position"].astype(np.float64) * HALF_TURN, quaternion, scale, opacities(state), sh
 
 
 def _linear(colours: NDArray[np.floating]) -> NDArray[np.floating]:

@@ -31,6 +31,7 @@ from modp_ti.outputs.formats.mesh import (
 )
 from modp_ti.outputs.formats.sog import write_sog, write_sog_lod
 from modp_ti.outputs.formats.textured_mesh import painted, require_atlas, unwrapped, write_textured_mesh
+from modp_ti.outputs.formats.usd import USD_SUFFIXES, write_usd
 from modp_ti.outputs.playback.film import VIDEO_SUFFIXES, film, plan_flight
 from modp_ti.outputs.playback.finished_run import FinishedRun
 from modp_ti.outputs.playback.map_renderer import MapRenderer, eight_bits, start_device
@@ -292,6 +293,7 @@ FORMATS = {
     "sog-lod": Format("splats-lod", _levels_of_detail),
     "compressed-ply": Format("splats.compressed.ply", _splats(write_compressed_ply), (".ply",)),
     "splat-glb": Format("splats.glb", _splats(write_splat_glb), (".glb",)),
+    "usd": Format("splats.usdc", _splats(write_usd), USD_SUFFIXES),
     "html": Format(PAGE, _page, (".html",)),
     "colmap": Format("colmap-dataset", _colmap),
     "nerfstudio": Format("nerfstudio", _nerfstudio),

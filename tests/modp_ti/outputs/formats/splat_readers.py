@@ -238,6 +238,27 @@ def read_glb(path: Path) -> State:
     }
 
 
+def read_usd(path: Path) -> State:
+    """Read the one prim of a stage through the schema that usd-core ships."""
+    from pxr import Usd, UsdGeom, UsdVol
+
+    stage = Usd.Stage.Open(str(path))
+    assert UsdGeom.GetStageUpAxis(stage) == "Y" and UsdGeom.GetStageMetersPerUnit(stage) == 1.0
+    splats = UsdVol.ParticleField3DGaussianSplat(stage.GetDefaultPrim())
+    turns = splats.GetOrientationsAttr().Get()
+    wxyz = np.array([[q.GetReal(), *q.GetImaginary()] for q in turns]).reshape(-1, 4)
+    coefficients = (splats.GetRadianceSphericalHarmonicsDegreeAttr().Get() + 1) ** 2
+    sh = np.array(splats.GetRadianceSphericalHarmonicsCoefficientsAttr().Get()).reshape(-1, coefficients, 3)
+    sh[:, [k for k in ODD if k < coefficients]] *= -1
+    return {
+        "position": np.array(splats.GetPositionsAttr().Get()).reshape(-1, 3) * [1, -1, -1],
+        "log_scale": np.log(splats.GetScalesAttr().Get()).reshape(-1, 3),
+        "quaternion": wxyz[:, [1, 0, 3, 2]] * [1, -1, 1, -1],  # (0, -1, 0, 0), w first, times it
+        "opacity_logit": logit(np.array(splats.GetOpacitiesAttr().Get())),
+        "sh": sh,
+    }
+
+
 READERS = {
     "ply": read_ply,
     "splat": read_splat,
@@ -245,4 +266,5 @@ READERS = {
     "sog": read_sog,
     "compressed-ply": read_compressed_ply,
     "splat-glb": read_glb,
+    "usd": read_usd,
 }

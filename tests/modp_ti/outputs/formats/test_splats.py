@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import zipfile
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,12 +21,14 @@ from modp_ti.outputs.formats.compressed_splats import write_compressed_ply, writ
 from modp_ti.outputs.formats.gltf import write_splat_glb
 from modp_ti.outputs.formats.sog import codebook, write_sog, write_sog_lod
 from modp_ti.outputs.formats.splats_ply import check_splats, read_splats, write_splats
+from modp_ti.outputs.formats.usd import USD_SUFFIXES, write_usd
 from modp_ti.outputs.playback.finished_run import open_splats
 from pipelines.whole.hierarchy import LEVELS, Hierarchy
 from tests.modp_ti.outputs.formats.splat_readers import ODD, READERS, read_sog
 from tests.pipelines.reference import sh_basis
 
 C0, FLOAT = 0.2820948, 1e-5
+FILE = "map.usdc"  # only usd asks for a suffix
 WRITERS = {
     "ply": write_splats,
     "splat": write_web_splat,
@@ -35,6 +38,7 @@ WRITERS = {
     "sog": write_sog,
     "compressed-ply": write_compressed_ply,
     "splat-glb": write_splat_glb,
+    **({"usd": write_usd} if find_spec("pxr") else {}),
 }
 
 
@@ -66,6 +70,7 @@ BOUNDS = {
     # spread evenly. Harmonics come from a palette, which has a test of its own.
     "sog": Bound(1.1 * 4 * np.log(4) / 65535, 4.6 / 127, 0.51 / 255, 0.02, 3.4 / 127, 2.0, 19),
     "splat-glb": EXACT._replace(log_scale=FLOAT, opacity=FLOAT, size=60),
+    "usd": EXACT._replace(log_scale=FLOAT, opacity=FLOAT, size=56),
 }
 
 
@@ -111,7 +116,7 @@ def written(form: str, state: dict, path: Path) -> dict[str, NDArray]:
 @pytest.mark.parametrize("form", WRITERS)
 def test_what_another_reader_reads_is_what_was_written_to_its_last_bits(tmp_path: Path, form: str, degree: int) -> None:
     state, bound = splats(700, degree), BOUNDS[form]
-    back = written(form, state, tmp_path / "file")
+    back = written(form, state, tmp_path / FILE)
     opacity, read = (1 / (1 + np.exp(-s["opacity_logit"].astype(float))) for s in (state, back))
     turn = Rotation.from_quat(back["quaternion"], scalar_first=True).inv() * Rotation.from_quat(
         state["quaternion"], scalar_first=True
@@ -135,31 +140,31 @@ def test_maps_of_any_scale_and_size_are_kept(tmp_path: Path, form: str) -> None:
     """Monocular scale is arbitrary: sizes of hundredths, or of hundreds."""
     for scale in (0.05, 30.0):
         state = splats(300, scale=scale)
-        back = written(form, state, tmp_path / "file")
+        back = written(form, state, tmp_path / FILE)
         assert np.abs(back["position"] - state["position"]).max() < 3e-3 * scale
         assert np.abs(back["log_scale"] - state["log_scale"]).max() < 0.04
     for count in (0, 1, 17):
-        WRITERS[form](tmp_path / "file", splats(count, degree=1))
-        assert not count or len(READERS[form.partition(" ")[0]](tmp_path / "file")["position"]) == count
+        WRITERS[form](tmp_path / FILE, splats(count, degree=1))
+        assert not count or len(READERS[form.partition(" ")[0]](tmp_path / FILE)["position"]) == count
 
 
 @pytest.mark.parametrize("form", WRITERS)
 def test_a_map_gives_one_file_of_the_size_of_its_layout(tmp_path: Path, form: str) -> None:
     state, size = splats(2000), BOUNDS[form].size
-    WRITERS[form](tmp_path / "file", state)
-    assert [p.name for p in tmp_path.iterdir()] == ["file"]
-    first = (tmp_path / "file").read_bytes()
+    WRITERS[form](tmp_path / FILE, state)
+    assert [p.name for p in tmp_path.iterdir()] == [FILE]
+    first = (tmp_path / FILE).read_bytes()
     assert 0.6 * size * 2000 < len(first) < size * 2000 + 4000
-    WRITERS[form](tmp_path / "file", state)
-    assert (tmp_path / "file").read_bytes() == first
+    WRITERS[form](tmp_path / FILE, state)
+    assert (tmp_path / FILE).read_bytes() == first
 
 
 # ---- what single formats promise ---------------------------------------------------------------------------------
 
 
 def test_the_most_important_gaussians_come_first_in_splat(tmp_path: Path) -> None:
-    write_web_splat(tmp_path / "file", splats(100))
-    back = READERS["splat"](tmp_path / "file")
+    write_web_splat(tmp_path / FILE, splats(100))
+    back = READERS["splat"](tmp_path / FILE)
     importance = np.exp(back["log_scale"].sum(axis=1)) / (1 + np.exp(-back["opacity_logit"]))
     assert importance[0] > importance[50] > importance[-1]
     assert importance[0] == pytest.approx(importance.max(), rel=0.05)
@@ -167,8 +172,8 @@ def test_the_most_important_gaussians_come_first_in_splat(tmp_path: Path) -> Non
 
 def test_neighbours_share_a_chunk_of_the_compressed_ply(tmp_path: Path) -> None:
     """So that its range is small, and 11 bits go far."""
-    write_compressed_ply(tmp_path / "file", splats(256 * 16))
-    chunks = READERS["compressed-ply"](tmp_path / "file")["position"].reshape(16, 256, 3)
+    write_compressed_ply(tmp_path / FILE, splats(256 * 16))
+    chunks = READERS["compressed-ply"](tmp_path / FILE)["position"].reshape(16, 256, 3)
     assert np.median(np.ptp(chunks, axis=1).prod(axis=1)) < 0.2 * 6.0**3
 
 
@@ -190,17 +195,17 @@ def test_a_map_far_from_the_origin_is_noted_where_spz_moves_its_splats(
     state["position"] += np.float32(origin)
     if noted is None:  # beyond 24 bits
         with pytest.raises(InputError, match="spz"):
-            write_spz(tmp_path / "file", state)
+            write_spz(tmp_path / FILE, state)
         return
-    note = write_spz(tmp_path / "file", state)
-    moved = np.abs(READERS["spz"](tmp_path / "file")["position"] - state["position"]).max()
+    note = write_spz(tmp_path / FILE, state)
+    moved = np.abs(READERS["spz"](tmp_path / FILE)["position"] - state["position"]).max()
     small = np.exp(np.quantile(state["log_scale"].max(axis=1), 0.05))
     assert bool(note) == noted == (moved > small / 8)
 
 
 def test_harmonics_take_about_the_nearest_entry_of_the_palette(tmp_path: Path) -> None:
     state = splats(600, degree=1)
-    back = written("sog", state, tmp_path / "file")
+    back = written("sog", state, tmp_path / FILE)
     there, here = (s["sh"][:, 1:].reshape(600, -1).astype(np.float64) for s in (back, state))
     entries = np.unique(there, axis=0)
     assert 20 < len(entries) <= 600 // 16
@@ -208,7 +213,7 @@ def test_harmonics_take_about_the_nearest_entry_of_the_palette(tmp_path: Path) -
     # But for a last round of means, and the codebook of the palette itself.
     assert np.linalg.norm(here - there, axis=1).mean() <= 1.1 * distance.min(axis=1).mean()
     alike = clustered(1500, degree=1)
-    error = written("sog", alike, tmp_path / "file")["sh"][:, 1:] - alike["sh"][:, 1:]
+    error = written("sog", alike, tmp_path / FILE)["sh"][:, 1:] - alike["sh"][:, 1:]
     assert error.std() < 0.1 * alike["sh"][:, 1:].std()
 
 
@@ -217,6 +222,25 @@ def test_a_codebook_misses_many_numbers_by_less_than_even_steps() -> None:
     codes, index = codebook(many)
     assert np.abs(codes[index] - many).max() <= np.ptp(many) / 127
     assert (codes[index] - many).std() < 0.8 * np.ptp(many) / 255 / np.sqrt(12)
+
+
+def test_usd_passes_its_own_checker_and_bounds_the_map(tmp_path: Path) -> None:
+    pytest.importorskip("pxr", reason="the extra usd")
+    from pxr import Usd, UsdGeom, UsdValidation
+
+    state = splats(300, degree=2)
+    validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
+    assert len(validators) > 20
+    for suffix in USD_SUFFIXES:
+        write_usd(tmp_path / f"map{suffix}", state)
+        stage = Usd.Stage.Open(str(tmp_path / f"map{suffix}"))
+        found = UsdValidation.ValidationContext(validators).Validate(stage)
+        assert not [error.GetErrorAsString() for error in found]
+        box = UsdGeom.BBoxCache(Usd.TimeCode.Default(), ["default"]).ComputeWorldBound(stage.GetPseudoRoot())
+        low, high = map(np.array, (box.GetRange().GetMin(), box.GetRange().GetMax()))
+        reach = 3 * np.exp(state["log_scale"].max(axis=1, keepdims=True))
+        np.testing.assert_allclose(low[0], (state["position"] - reach).min(axis=0)[0], rtol=1e-6)
+        np.testing.assert_allclose(high[1], -(state["position"] - reach).min(axis=0)[1], rtol=1e-6)
 
 
 # ---- streamed SOG ------------------------------------------------------------------------------------------------
