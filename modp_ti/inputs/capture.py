@@ -171,8 +171,7 @@ def size_of_pictures(tree: FileTree, names: Iterable[str]) -> tuple[int, int]:
     for name in names:
         with suppress(OSError):
             header = read_image_header(io.BytesIO(tree.read(name)))
-            if header is not None:
-                return header.width, header.height
+            return header.width, header.height
     raise InputError(f"{tree.path}: holds no picture that can be read; copy it again")
 
 

@@ -152,7 +152,7 @@ class DepthCaptureSettings(CaptureSettings):
             try:
                 depth = capture.read_depth(capture.tree, stored)
             except OSError as error:
-                damaged.append(f"{capture.tree.path / stored.depth}: unreadable depth map: {error.strerror}")
+                damaged.append(f"{capture.tree.path / stored.depth}: unreadable depth map: {error.strerror or error}")
                 continue
             points[-1] = depth_points(depth, stored, turn, frame, index, self.max_points, self.max_depth)
         if len(damaged) > FEW * len(points):

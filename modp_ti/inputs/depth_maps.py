@@ -12,7 +12,7 @@ from fields.geometry.se3 import inverse_se3
 from modp_ti.files.file_tree import FileTree
 from modp_ti.inputs.capture import CapturedFrame, DepthMap
 from modp_ti.inputs.replay import PosedImage, points_inside
-from modp_ti.inputs.sources.image_header import why_undecodable
+from modp_ti.inputs.sources.image_header import decodable
 from modp_ti.inputs.sources.image_pixels import decoded_as
 from modp_ti.inputs.sources.orientation import Turn
 from modp_ti.inputs.sources.undistortion import Undistorter
@@ -52,10 +52,10 @@ def _decoded(tree: FileTree, name: str) -> NDArray[np.uint8] | NDArray[np.uint16
     import cv2
 
     data = tree.read(name)
-    reason = why_undecodable(data)
-    picture = None if reason is not None or not data else decoded_as(data, cv2.IMREAD_UNCHANGED)
+    decodable(data)
+    picture = decoded_as(data, cv2.IMREAD_UNCHANGED)
     if picture is None or picture.ndim != 2 or picture.dtype not in (np.uint8, np.uint16):
-        raise OSError(0, reason or "it is no grey picture of 8 or 16 bits")
+        raise OSError(0, "it is no grey picture of 8 or 16 bits")
     return picture
 
 

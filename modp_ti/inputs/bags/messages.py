@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import re
 import struct
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,7 +15,7 @@ from modp_ti.files.trajectory import FARTHEST
 from modp_ti.inputs.bags.bag import VIDEO
 from modp_ti.inputs.capture import checked_numbers, plausible_camera
 from modp_ti.inputs.sources.distortion import NO_DISTORTION, lens_of_model
-from modp_ti.inputs.sources.image_header import read_image_header, why_undecodable
+from modp_ti.inputs.sources.image_header import decodable, read_image_header
 from modp_ti.inputs.sources.image_pixels import DEPTHS, decoded, decoded_as, reduced
 from modp_ti.inputs.sources.undistortion import Intrinsics
 
@@ -101,8 +102,10 @@ def picture_size(message: Any) -> tuple[int, int] | None:
     """Return the size (width, height) that an image message states; None if it states none, or is cut off."""
     if not is_compressed(message):
         return (message.width, message.height) if message.width > 0 and message.height > 0 else None
-    header = read_image_header(io.BytesIO(message.data.tobytes()))
-    return None if header is None or not header.complete or header.width < 1 else (header.width, header.height)
+    with suppress(OSError):
+        header = read_image_header(io.BytesIO(message.data.tobytes()))
+        return header.width, header.height
+    return None
 
 
 def picture(message: Any, bits: int = DEPTHS[-1]) -> NDArray[np.uint8]:
@@ -119,10 +122,10 @@ def picture(message: Any, bits: int = DEPTHS[-1]) -> NDArray[np.uint8]:
 
     if is_compressed(message):
         data = message.data.tobytes()
-        reason = why_undecodable(data)
-        image = decoded(data) if reason is None else None
+        decodable(data)
+        image = decoded(data)
         if image is None:
-            raise ValueError(reason or "it is damaged or no image")
+            raise ValueError("it is damaged or no image")
         return image
     layout = LAYOUTS.get(message.encoding)
     if layout is None:
@@ -165,10 +168,10 @@ def depth_metres(message: Any) -> NDArray[np.float32]:
 
     data = message.data.tobytes()
     head, png = data[: DEPTH_HEADER.size], data[DEPTH_HEADER.size :]
-    reason = why_undecodable(png)
-    stored = None if reason is not None else decoded_as(png, cv2.IMREAD_UNCHANGED)
+    decodable(png)
+    stored = decoded_as(png, cv2.IMREAD_UNCHANGED)
     if stored is None or stored.ndim != 2 or stored.dtype != np.uint16:
-        raise ValueError(reason or "it holds no grey picture of 16 bits")
+        raise ValueError("it holds no grey picture of 16 bits")
     if not message.format.startswith("32FC1"):
         return np.divide(stored, 1000.0, dtype=np.float32)
     _, scale, offset = DEPTH_HEADER.unpack(head)

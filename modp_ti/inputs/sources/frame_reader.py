@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from fields.geometry.camera import PinholeCamera
 from modp_ti.files import read_bytes, reading
 from modp_ti.files.errors import InputError, UnreadableImageError
-from modp_ti.inputs.sources.image_folder import ImageFolder, ListedImages, decoded_as
-from modp_ti.inputs.sources.image_header import why_undecodable
+from modp_ti.inputs.sources.image_folder import ImageFolder, ListedImages
+from modp_ti.inputs.sources.image_header import decodable
+from modp_ti.inputs.sources.image_pixels import decoded_as
 from modp_ti.inputs.sources.protocol import ImageSource
 from modp_ti.inputs.sources.undistortion import Undistorter, both_valid
 
@@ -134,11 +135,9 @@ def read_vignette(path: Path) -> NDArray[np.float32]:
 
     with reading(path, "; it should be the vignette (source.vignette)"):
         data = read_bytes(path)
-    reason = why_undecodable(data)
-    if data and reason is not None:
-        raise InputError(f"{path}: the vignette is no image that can be used: {reason} (source.vignette)")
+        decodable(data)
     flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
-    image = decoded_as(data, flags) if data else None
+    image = decoded_as(data, flags)
     if image is None or not 0 < image.max() < np.inf:
         raise InputError(f"{path}: the vignette is {'no image' if image is None else 'black'} (source.vignette)")
     image = image.astype(np.float32) / float(image.max())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 import re
 import unicodedata
@@ -19,12 +18,11 @@ from numpy.typing import NDArray
 from modp_ti.files import open_file, read_bytes
 from modp_ti.files.errors import InputError, UnreadableImageError
 from modp_ti.files.run_folder import PRIVATE
-from modp_ti.inputs.sources.image_header import ImageHeader, read_image_header, why_undecodable
+from modp_ti.inputs.sources.image_header import ImageHeader, decodable, read_image_header
 from modp_ti.inputs.sources.image_pixels import (
     DEPTHS,
     alpha_of,
     decoded,
-    decoded_as,
     decoded_deep,
     used_bits,
     way_to_srgb,
@@ -108,19 +106,11 @@ class ListedImages(ImageSource):
             UnreadableImageError: If the image is unreadable or truncated.
         """
         turn, _, _ = self.turn(name), self._bits, self._transparent  # they add their notes when the source is opened
-        try:
-            with self._open(name) as file:
-                header = read_image_header(file)
-        except OSError as error:
-            raise self._unreadable(name, error.strerror or "it cannot be opened") from None
-        if header is None or header.complete is None:
-            height, width = self.read(name).shape[:2]
-            return width, height
-        if not header.complete:
-            raise self._unreadable(name, "the file is cut off")
-        if header.width < 1 or header.height < 1:
-            raise self._unreadable(name, "its header is damaged")
-        return turn.size(header.width, header.height)
+        header = self.headers.get(name)
+        if header is not None and header.complete:
+            return turn.size(header.width, header.height)
+        height, width = self.read(name).shape[:2]
+        return width, height
 
     def turn(self, name: str) -> Turn:
         """Return how the stored image is turned upright."""
@@ -133,12 +123,9 @@ class ListedImages(ImageSource):
             UnreadableImageError: If the image is unreadable or truncated.
         """
         turn, bits = self.turn(name), self._bits
-        data, header = self._checked(name)
-        image = decoded(data, bits, header)
+        image = decoded(*self._checked(name), bits)
         if image is None:
-            deep = decoded_as(data, -1)  # as it is stored
-            what = "it is damaged or no image" if deep is None else f"{deep.dtype} is not read: convert it to 16 bits"
-            raise self._unreadable(name, what)
+            raise self._unreadable(name, "it is damaged, or of numbers that are not read: convert it to 16 bits")
         return turn.image(image)
 
     def valid(self, name: str) -> NDArray[np.bool_] | None:
@@ -164,21 +151,13 @@ class ListedImages(ImageSource):
         """Read an image file. Raises OSError."""
         return read_bytes(self.path / name)
 
-    def _checked(self, name: str) -> tuple[bytes, ImageHeader | None]:
+    def _checked(self, name: str) -> tuple[bytes, ImageHeader]:
         """Read an image file and check that it can be decoded. Raises UnreadableImageError."""
         try:
             data = self._content(name)
+            return data, decodable(data)
         except OSError as error:
-            raise self._unreadable(name, error.strerror or "it cannot be opened") from None
-        header = read_image_header(io.BytesIO(data))
-        if not data:
-            raise self._unreadable(name, "the file is empty")
-        if header is not None and header.complete is False:
-            raise self._unreadable(name, "the file is cut off")
-        reason = why_undecodable(data)
-        if reason is not None:
-            raise self._unreadable(name, reason)
-        return data, header
+            raise self._unreadable(name, error.strerror or str(error)) from None
 
     @cached_property
     def _turns(self) -> dict[str, Turn]:
@@ -224,13 +203,11 @@ class ListedImages(ImageSource):
 
     @cached_property
     def headers(self) -> dict[str, ImageHeader]:
-        """The header of each file that `read_image_header` can read, by name. All are read at once."""
+        """The header of each file that is not damaged, by name. All are read at once."""
         headers = {}
         for name in self.names:
             with suppress(OSError), self._open(name) as file:
-                header = read_image_header(file)
-                if header is not None and header.width > 0:
-                    headers[name] = header
+                headers[name] = read_image_header(file)
         return headers
 
     def _unreadable(self, name: str, reason: str) -> UnreadableImageError:
@@ -357,7 +334,7 @@ def _is_depth(path: Path) -> bool:
         start = re.match(rb"P5\s+[0-9]+\s+[0-9]+\s+([0-9]+)", file.read(64))
         file.seek(0)
         header = read_image_header(file)
-        return int(start[1]) > 255 if start else header is not None and header.grey and header.bits == 16
+        return int(start[1]) > 255 if start else header.grey and header.bits == 16
     return False
 
 

@@ -45,16 +45,20 @@ HEADER_ERRORS = (
 warnings.filterwarnings("ignore", category=UserWarning, module=r"PIL\.TiffImagePlugin")
 
 
+class DamagedImageError(OSError, ValueError):
+    """An image cannot be decoded, or should not be. The text says why, in words for within a message."""
+
+
 @dataclass(frozen=True)
 class ImageHeader:
-    """Size, orientation, depth and completeness of an image file.
+    """Size, orientation and depth of an image file whose end is there, as far as that can be told without decoding it.
 
     Attributes:
-        width: Width [px] of the decoded image, before any EXIF rotation; 0 if the header is damaged.
+        width: Width [px] of the decoded image, before any EXIF rotation.
         height: Height [px], likewise.
-        complete: Whether the end of the file is there; None if only the decoder finds out.
+        complete: Whether the end of the file is there; False if only the decoder finds out.
         orientation: EXIF orientation, 1 to 8, which is left to apply; 1 if the file states none.
-        bits: Bits per channel.
+        bits: Bits per channel; 16 if only the decoder finds out.
         alpha: Whether a PNG, WebP or TIFF file has an alpha channel.
         grey: Whether a PNG or TIFF file has one channel.
         profile: ICC profile of the colours; empty without.
@@ -64,7 +68,7 @@ class ImageHeader:
 
     width: int
     height: int
-    complete: bool | None
+    complete: bool
     orientation: int = 1
     bits: int = 8
     alpha: bool = False
@@ -82,39 +86,61 @@ def heif_kind(start: bytes) -> str | None:
     return "AVIF" if b"avif" in first or b"avis" in first else "HEIF"
 
 
-def read_image_header(file: BinaryIO) -> ImageHeader | None:
-    """Read the header of an open JPEG, PNG, WebP, TIFF, HEIC or AVIF file. Returns None for all other files.
+def read_image_header(file: BinaryIO) -> ImageHeader:
+    """Read the header of an open JPEG, PNG, BMP, TIFF, WebP, PNM, JPEG 2000, HEIC or AVIF file.
 
     Raises:
+        DamagedImageError: If it is none, or is cut off.
         InputError: If the package that reads HEIC or AVIF is missing.
     """
     start = file.read(64)
     file.seek(0)
     is_jpeg, is_png, is_tiff = start[:2] == JPEG_SIGNATURE, start[:8] == PNG_SIGNATURE, start[:4] in TIFF_SIGNATURES
-    is_heif = heif_kind(start) is not None
-    if not (is_jpeg or is_png or is_tiff or is_heif or (start[:4] == b"RIFF" and start[8:12] == b"WEBP")):
-        return None
-    image = None
     try:
         # As a class, which leaves the file at the first coded byte.
         image = JpegImagePlugin.JpegImageFile(file) if is_jpeg else open_image(file)
         complete = _is_complete(file, start)
         tags = image.tag_v2 if isinstance(image, TiffImagePlugin.TiffImageFile) else {}
         size = (TiffImagePlugin.IMAGEWIDTH, TiffImagePlugin.IMAGELENGTH)  # Pillow states that of the upright image
-        return ImageHeader(
+        bits = int(np.max(tags.get(TiffImagePlugin.BITSPERSAMPLE, 8)))
+        header = ImageHeader(
             *([int(tags[tag]) for tag in size] if is_tiff else image.size),
-            complete=complete,
+            complete=complete is True,
             orientation=_orientation(image),
-            bits=start[24] if is_png else int(np.max(tags.get(TiffImagePlugin.BITSPERSAMPLE, 8))),
-            alpha=not is_heif and image.has_transparency_data,
+            bits=start[24] if is_png else 16 if image.format in ("PPM", "JPEG2000") else bits,
+            alpha=image.format in ("PNG", "WEBP", "TIFF") and image.has_transparency_data,
             grey=(is_png or is_tiff) and len(image.getbands()) == 1 and image.mode != "P",
             profile=image.info.get("icc_profile") or b"",
             panorama=is_jpeg and bool(GPANO.search(image.info.get("xmp") or b"")),
             is_tiff=is_tiff,
         )
+    except Image.DecompressionBombError:
+        raise DamagedImageError(f"its pixels are more than {MAX_IMAGE_PIXELS:,}") from None
     except HEADER_ERRORS:
-        file.seek(0)
-        return ImageHeader(0, 0, _is_complete(file, start)) if is_jpeg or is_png or is_heif else None
+        raise DamagedImageError(
+            "it is damaged or no image (JPEG, PNG, BMP, TIFF of up to 16 bits, WebP, PPM, PGM, JPEG 2000, HEIC or AVIF)"
+        ) from None
+    if complete is False:
+        raise DamagedImageError("the file is cut off")
+    return header
+
+
+def decodable(data: bytes) -> ImageHeader:
+    """Return the header of an image file's content that may be decoded.
+
+    Raises:
+        DamagedImageError: As `read_image_header`, if it has more than `MAX_IMAGE_PIXELS` pixels, or if there is too
+            little memory for them.
+        InputError: As `read_image_header`.
+    """
+    header = read_image_header(io.BytesIO(data))
+    size, pixels = f"its {header.width}x{header.height} pixels", header.width * header.height
+    if pixels > MAX_IMAGE_PIXELS:
+        raise DamagedImageError(f"{size} are more than {MAX_IMAGE_PIXELS:,}")
+    needed, left = pixels * DECODED_BYTES, available_memory()
+    if needed > left:
+        raise DamagedImageError(f"{size} take {needed >> 20} MB, and {left >> 20} MB are free: end other programs")
+    return header
 
 
 def open_image(file: BinaryIO) -> Image.Image:
@@ -182,34 +208,6 @@ def _boxes_are_whole(file: BinaryIO) -> bool:
             return len(head) >= 8
         at += max(int.from_bytes(head[8:], "big") if length == 1 else length, 8)
     return at == size
-
-
-def why_undecodable(data: bytes) -> str | None:
-    """Return why these bytes should not be decoded, or None if they may be.
-
-    Accepted are JPEG, PNG, BMP, TIFF, WebP, PNM, JPEG 2000, HEIC and AVIF images of at most `MAX_IMAGE_PIXELS` pixels
-    for which there is memory.
-
-    Raises:
-        InputError: If the package that reads HEIC or AVIF is missing.
-    """
-    try:
-        with open_image(io.BytesIO(data)) as image:
-            width, height = image.size
-    except Image.UnidentifiedImageError:
-        if data[:4] in TIFF_SIGNATURES:
-            return "it is damaged, or a TIFF file of numbers that are not read: convert it to 16 bits"
-        return "it is damaged or no image (JPEG, PNG, BMP, TIFF, WebP, PPM, PGM, JPEG 2000, HEIC or AVIF)"
-    except Image.DecompressionBombError:
-        return f"its pixels are more than {MAX_IMAGE_PIXELS:,}"
-    except HEADER_ERRORS:
-        return "its header is damaged"
-    if width * height > MAX_IMAGE_PIXELS:
-        return f"its {width}x{height} pixels are more than {MAX_IMAGE_PIXELS:,}"
-    needed, left = width * height * DECODED_BYTES, available_memory()
-    if needed > left:
-        return f"its {width}x{height} pixels take {needed >> 20} MB, and {left >> 20} MB are free: end other programs"
-    return None
 
 
 def focal_length_35mm(path: Path) -> float | None:

@@ -25,13 +25,13 @@ DEPTHS = (8, 10, 12, 14, 16)
 SAME = 3
 
 
-def decoded(data: bytes, bits: int = DEPTHS[-1], header: ImageHeader | None = None) -> NDArray[np.uint8] | None:
+def decoded(data: bytes, header: ImageHeader | None = None, bits: int = DEPTHS[-1]) -> NDArray[np.uint8] | None:
     """Decode an image file's bytes to (H, W, 3) uint8 RGB, without EXIF rotation (HEIC upright); None if that fails.
 
     Args:
         data: The file's content.
-        bits: How many bits an image of 16 bits per channel uses.
         header: The file's header, whose colour profile is applied; None to keep the colours as they are stored.
+        bits: How many bits an image of 16 bits per channel uses.
     """
     import cv2
 

@@ -22,7 +22,7 @@ from fields.runtime.process import has_room
 from modp_ti.files.errors import InputError, shown_url
 from modp_ti.files.processes import RecordingInterrupt
 from modp_ti.inputs.sources.backlog import Arrivals, Backlog
-from modp_ti.inputs.sources.image_header import read_image_header
+from modp_ti.inputs.sources.image_header import DamagedImageError, read_image_header
 from modp_ti.inputs.sources.image_pixels import decoded, quiet_opencv
 from modp_ti.inputs.sources.protocol import ImageSource
 
@@ -381,8 +381,7 @@ def list_frames(folder: Path) -> None:
     """Write the list that makes the folder of a killed process a recording. Raises OSError if it cannot be written."""
     lines = []
     for file in sorted(folder.glob("[0-9]*.png")):
-        with file.open("rb") as image:
-            header = read_image_header(image)
-        if header is not None and header.complete:  # the last one may be cut off
+        with suppress(DamagedImageError), file.open("rb") as image:  # the last one may be cut off
+            read_image_header(image)
             lines.append(f"{file.stat().st_mtime_ns / 1e9!r} {file.name}\n")
     (folder / "rgb.txt").write_text("".join(lines), encoding="utf-8")

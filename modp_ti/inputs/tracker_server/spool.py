@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 import tempfile
 import time
@@ -18,7 +17,7 @@ from fields.frames.tracked_frame import SparsePoints
 from fields.runtime.process import has_room
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.sources import FrameReader
-from modp_ti.inputs.sources.image_header import read_image_header, why_undecodable
+from modp_ti.inputs.sources.image_header import decodable
 from modp_ti.inputs.sources.image_pixels import decoded_as
 from modp_ti.inputs.sources.protocol import ImageSource
 from modp_ti.inputs.tracker_server.messages import (
@@ -144,14 +143,14 @@ class Spool(ImageSource):
             wanted = width * height * self._encoding.channels
             return None if len(image) == wanted else f"its image has {len(image)} bytes, HELLO says {wanted}"
         start = b"\xff\xd8" if self._encoding is Encoding.JPEG else b"\x89PNG"
-        header = read_image_header(io.BytesIO(image)) if image.startswith(start) else None
-        if header is None:
+        if not image.startswith(start):
             return f"its image is no {self._encoding.name}"
-        if not header.complete:
-            return f"its {self._encoding.name} image is cut off"
-        if (header.width, header.height) != (width, height):
-            return f"its image is {header.width}x{header.height}, HELLO says {width}x{height}"
-        return why_undecodable(image) if self._encoding is Encoding.JPEG else None
+        try:
+            header = decodable(image)
+        except OSError as error:
+            return f"its {self._encoding.name} image cannot be decoded: {error}"
+        fits = (header.width, header.height) == (width, height)
+        return None if fits else f"its image is {header.width}x{header.height}, HELLO says {width}x{height}"
 
     def find(self, name: str) -> str | None:
         return name if name in self._position else None
