@@ -41,6 +41,6 @@ class SocketSettings(TrackerSettings):
 
     def open(self, scene: Scene, progress: Progress | None = None) -> Tracker:
         """Listen at the address. Frames arrive once a sender has connected."""
-        from modp_ti.inputs.tracker_server import open_tracker_server
+        from modp_ti.inputs.tracker_server import TrackerServer
 
-        return open_tracker_server(scene.source, self, progress)
+        return TrackerServer(scene.source, self, progress)

@@ -5,6 +5,6 @@
 
 from __future__ import annotations
 
-from modp_ti.inputs.tracker_server.tracker import TrackerServer, open_tracker_server
+from modp_ti.inputs.tracker_server.tracker import TrackerServer
 
-__all__ = ["TrackerServer", "open_tracker_server"]
+__all__ = ["TrackerServer"]

@@ -6,7 +6,7 @@ import ipaddress
 import selectors
 import socket
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 from threading import Event
 
@@ -124,30 +124,16 @@ class Lobby:
 
     def next(self, timeout: float) -> socket.socket | None:
         """Return a connection with data to read or at its end, or None after `timeout` seconds without one."""
-        spoken = self._spoken(timeout)
-        if spoken is None:
-            self._drop(sock for sock, until in self._silent.items() if time.monotonic() > until)
-        else:
-            self._forget(spoken)
-        return spoken
-
-    def waits(self) -> bool:
-        """Whether a connection has data to read or is at its end."""
-        return self._spoken(0.0) is not None
-
-    def take_back(self, sock: socket.socket, patience: float) -> None:
-        """Keep a connection until it says more, for so many seconds."""
-        self._silent[sock] = time.monotonic() + patience
-        self._selector.register(sock, selectors.EVENT_READ, data=sock)
-
-    def _spoken(self, timeout: float) -> socket.socket | None:
-        """Accept connections for up to `timeout` seconds; return the first one with data to read or at its end."""
         spoken: socket.socket | None = None
         for key, _ in self._selector.select(timeout):
             if key.fileobj is self._listener:
                 self._accept()
             elif spoken is None:
                 spoken = key.data
+        if spoken is None:
+            self._drop(sock for sock, until in self._silent.items() if time.monotonic() > until)
+        else:
+            self._forget(spoken)
         return spoken
 
     def close(self) -> None:
@@ -161,7 +147,8 @@ class Lobby:
             sock, _ = self._listener.accept()
         except OSError:  # the client has disconnected, or there are too many open files
             return
-        self.take_back(sock, self._patience)
+        self._silent[sock] = time.monotonic() + self._patience
+        self._selector.register(sock, selectors.EVENT_READ, data=sock)
         self._drop(list(self._silent)[:-MAX_SILENT])
 
     def _drop(self, sockets: Iterable[socket.socket]) -> None:
@@ -179,10 +166,6 @@ class SenderGoneError(Exception):
     """The connection has ended or timed out. The text says how, in one line."""
 
 
-class OthersSpeakError(Exception):
-    """The sender is silent between two messages, and another one is not."""
-
-
 class Connection:
     """Reads messages from a connected socket.
 
@@ -190,25 +173,19 @@ class Connection:
         sock: The socket.
         patience: Timeout [s] for each whole message.
         closed: Set by another thread to stop reading.
-
-    Attributes:
-        socket: As the argument.
-        hello: Payload of the HELLO, kept by the caller.
     """
 
     def __init__(self, sock: socket.socket, patience: float, closed: Event) -> None:
-        self.socket = sock
-        self.hello: bytes | None = None
+        self._socket = sock
         self._patience = patience
         self._closed = closed
         self._reset = False
 
-    def receive(self, hello: Hello | None, others: Callable[[], bool] = lambda: False) -> tuple[Kind, bytes]:
+    def receive(self, hello: Hello | None) -> tuple[Kind, bytes]:
         """Read the next message. Its header is checked before the payload is read.
 
         Args:
             hello: The connection's HELLO; None before it.
-            others: Returns whether another sender waits with something to say.
 
         Returns:
             The message's kind and payload.
@@ -216,28 +193,22 @@ class Connection:
         Raises:
             ProtocolError: If the header is invalid.
             SenderGoneError: If the connection ends or times out.
-            OthersSpeakError: If `others` does, and this sender is silent.
         """
         patience = self._patience if hello else min(self._patience, FIRST_PATIENCE)
         deadline = time.monotonic() + patience
-        kind, length = parse_header(self._read(HEADER.size, deadline, patience, False, others), hello)
-        return kind, self._read(length, deadline, patience, True, others)
+        kind, length = parse_header(self._read(HEADER.size, deadline, patience, False), hello)
+        return kind, self._read(length, deadline, patience, True)
 
-    def _read(self, size: int, deadline: float, patience: float, begun: bool, others: Callable[[], bool]) -> bytes:
-        data, heard = bytearray(), time.monotonic()
+    def _read(self, size: int, deadline: float, patience: float, begun: bool) -> bytes:
+        data = bytearray()
         while len(data) < size:
             if self._closed.is_set():
                 raise SenderGoneError("the sender is let go: the run is over")
             left = deadline - time.monotonic()
             try:
-                self.socket.settimeout(min(max(left, 0.001), GLANCE))
-                part = self.socket.recv(min(size - len(data), CHUNK))
+                self._socket.settimeout(min(max(left, 0.001), GLANCE))
+                part = self._socket.recv(min(size - len(data), CHUNK))
             except TimeoutError:
-                if left > 0 and others():
-                    if not begun and not data:
-                        raise OthersSpeakError from None
-                    if time.monotonic() - heard > FIRST_PATIENCE:
-                        left, patience = 0.0, FIRST_PATIENCE
                 if left > 0:
                     continue
                 where = "in mid-message" if begun or data else "without a message"
@@ -255,14 +226,13 @@ class Connection:
                     "the sender ended in mid-message" if begun or data else "the sender ended without END"
                 )
             data += part
-            heard = time.monotonic()
         return bytes(data)
 
     def say(self, kind: Kind, payload: bytes = b"") -> None:
         """Send a message. Errors are ignored, because the sender need not read replies."""
         try:
-            self.socket.settimeout(DRAIN_SECONDS)
-            self.socket.sendall(encoded(kind, payload))
+            self._socket.settimeout(DRAIN_SECONDS)
+            self._socket.sendall(encoded(kind, payload))
         except OSError:
             pass
 
@@ -271,8 +241,8 @@ class Connection:
         self.say(Kind.ERROR, " ".join(str(reason).split()).encode())
         deadline = time.monotonic() + DRAIN_SECONDS
         try:
-            self.socket.shutdown(socket.SHUT_WR)
-            while time.monotonic() < deadline and self.socket.recv(CHUNK):
+            self._socket.shutdown(socket.SHUT_WR)
+            while time.monotonic() < deadline and self._socket.recv(CHUNK):
                 pass
         except OSError:
             pass
@@ -280,4 +250,4 @@ class Connection:
 
     def close(self) -> None:
         """Close the connection."""
-        self.socket.close()
+        self._socket.close()

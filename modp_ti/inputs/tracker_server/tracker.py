@@ -8,10 +8,10 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from queue import Empty, Full, Queue
-from socket import SHUT_WR, create_connection, socket
+from socket import SHUT_WR, create_connection
 from threading import Event as Flag
 from threading import Thread
-from typing import TYPE_CHECKING, ClassVar, Protocol
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -25,7 +25,6 @@ from modp_ti.inputs.tracker_server.listening import (
     GLANCE,
     Connection,
     Lobby,
-    OthersSpeakError,
     SenderGoneError,
     listen,
     open_to_others,
@@ -45,6 +44,7 @@ from modp_ti.inputs.tracker_server.ordering import Ordering
 from modp_ti.inputs.tracker_server.spool import Spool, SpoolFullError, is_stream
 
 if TYPE_CHECKING:
+    from modp_ti.inputs.readers.socket import SocketSettings
     from modp_ti.inputs.source_settings import SourceSettings
 
 # What the server has received, in order; None at its end. Images and points of frames are in the spool.
@@ -59,35 +59,6 @@ MAX_WAITING = 1000
 FEW_UNFIT, UNFIT_SHARE = 3, 0.1
 
 
-class Listening(Protocol):
-    """What `SocketSettings` says of where to listen, and for how long."""
-
-    address: str | None
-    path: Path | None
-    patience: float
-
-
-def open_tracker_server(source: SourceSettings, tracker: Listening, progress: Progress | None = None) -> TrackerServer:
-    """Start a server at the configured address.
-
-    Args:
-        source: Settings of the images. `path`, `start`, `stop` and `step` must not be set.
-        tracker: Address or path of the socket, and timeout.
-        progress: Called when the server starts to wait for a tracker, and when the wait is over.
-
-    Returns:
-        The listening server. Frames arrive once a sender has connected.
-
-    Raises:
-        InputError: If the server cannot listen at this address, or if settings select files or frames.
-    """
-    if source.start or source.stop is not None or source.step != 1:
-        raise InputError("tracker.kind: socket takes every frame that is sent: take source.start, stop and step out")
-    if source.path is not None:
-        raise InputError("tracker.kind: socket gets its images through the socket: take source.path out")
-    return TrackerServer(source, tracker, progress)
-
-
 class TrackerServer(Tracker):
     """A live `Tracker` that listens on a socket and delivers what another program sends.
 
@@ -99,18 +70,28 @@ class TrackerServer(Tracker):
     run continues with the frames received so far. Received data are kept in a temporary folder until `close`.
 
     Args:
-        source: Settings of the images: scale, masks, held-out frames, queue length.
+        source: Settings of the images: scale, masks, held-out frames, queue length. `path`, `start`, `stop` and `step`
+            must not be set.
         tracker: Address or path of the socket, and timeout.
         progress: Called when the server starts to wait for a tracker, and when the wait is over.
 
     Attributes:
         address: Where the server listens, as `host:port` or `unix:path`.
+
+    Raises:
+        InputError: If the server cannot listen at this address, or if settings select files or frames.
     """
 
     reads_ahead: ClassVar[bool] = True
     corrects: ClassVar[bool] = True
 
-    def __init__(self, source: SourceSettings, tracker: Listening, progress: Progress | None = None) -> None:
+    def __init__(self, source: SourceSettings, tracker: SocketSettings, progress: Progress | None = None) -> None:
+        if source.start or source.stop is not None or source.step != 1:
+            raise InputError(
+                "tracker.kind: socket takes every frame that is sent: take source.start, stop and step out"
+            )
+        if source.path is not None:
+            raise InputError("tracker.kind: socket gets its images through the socket: take source.path out")
         self._source = source
         self._patience = tracker.patience
         self._again = tracker.path if is_stream(tracker.path) else None
@@ -221,7 +202,6 @@ class TrackerServer(Tracker):
     def _serve(self) -> None:
         end: InputError | None = None
         lobby = Lobby(self._listener, self._patience)
-        waiting: dict[socket, Connection] = {}  # connections that have said HELLO and are in the lobby again
         try:
             while not self._closed.is_set():
                 sock = lobby.next(GLANCE)
@@ -230,13 +210,8 @@ class TrackerServer(Tracker):
                     lobby.dropped = 0
                 if sock is None:
                     continue
-                connection = waiting.pop(sock, None) or Connection(sock, self._patience, self._closed)
-                try:
-                    if self._talk(connection, lobby) or self._again:
-                        break
-                except OthersSpeakError:
-                    lobby.take_back(sock, self._patience)
-                    waiting[sock] = connection
+                if self._talk(Connection(sock, self._patience, self._closed)) or self._again:
+                    break
         except InputError as error:
             end = error
         except Exception as error:  # a bug in this thread must end the run instead of leaving it waiting
@@ -248,29 +223,20 @@ class TrackerServer(Tracker):
                 self._path.unlink(missing_ok=True)
             self._put(end)
 
-    def _talk(self, connection: Connection, lobby: Lobby) -> bool:
-        """Serve one connection until it ends. Returns whether the stream has ended with it.
-
-        Raises OthersSpeakError if it has only said HELLO, and another one in the lobby speaks.
-        """
+    def _talk(self, connection: Connection) -> bool:
+        """Serve one connection until it ends. Returns whether the stream has ended with it."""
         ordering = Ordering()
         hello: Hello | None = None
         problem = None
         try:
             while True:
-                if connection.hello is None or hello is not None:
-                    others = (lambda: False) if ordering.begun else lobby.waits
-                    kind, payload = connection.receive(hello, others)
-                else:  # it was in the lobby meanwhile
-                    kind, payload = Kind.HELLO, connection.hello
+                kind, payload = connection.receive(hello)
                 if kind is Kind.HELLO:
                     hello = parse_hello(payload)
                     if self._spool is not None:
                         self._spool.close()  # left by a connection that sent no frame
                     self._spool = Spool(hello, self._source)
-                    if connection.hello is None:
-                        connection.say(Kind.WELCOME)
-                    connection.hello = payload
+                    connection.say(Kind.WELCOME)
                 place = self._received.keep(kind, payload)
                 if kind is Kind.END:
                     break

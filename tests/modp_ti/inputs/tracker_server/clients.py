@@ -14,7 +14,7 @@ from fields.frames.tracked_frame import TrackedFrame
 from modp_ti.inputs.protocol import Event
 from modp_ti.inputs.readers.socket import SocketSettings
 from modp_ti.inputs.source_settings import SourceSettings
-from modp_ti.inputs.tracker_server import TrackerServer, open_tracker_server
+from modp_ti.inputs.tracker_server import TrackerServer
 from tests.patience import PATIENCE
 
 HELLO, FRAME, POSE, CORRECTION, END = 1, 2, 3, 4, 5
@@ -24,7 +24,7 @@ SIZE = (8, 6)
 
 @contextmanager
 def opened(path: Path, patience: float = 20.0, **source: object) -> Iterator[TrackerServer]:
-    tracker = open_tracker_server(SourceSettings(**source), SocketSettings(path=path, patience=patience))
+    tracker = TrackerServer(SourceSettings(**source), SocketSettings(path=path, patience=patience))
     try:
         yield tracker
     finally:

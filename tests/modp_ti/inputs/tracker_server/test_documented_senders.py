@@ -15,7 +15,7 @@ from modp_ti.config.scene_file import load_scene
 from modp_ti.engine.session import run_scene
 from modp_ti.inputs.readers.socket import SocketSettings
 from modp_ti.inputs.source_settings import SourceSettings
-from modp_ti.inputs.tracker_server import open_tracker_server
+from modp_ti.inputs.tracker_server import TrackerServer
 from tests.modp_ti.runs import SHORT_RUN
 from tests.patience import PATIENCE
 
@@ -29,7 +29,7 @@ output:  out
 
 
 def received(command: list[str]) -> list:
-    tracker = open_tracker_server(SourceSettings(), SocketSettings(address="127.0.0.1:0"))
+    tracker = TrackerServer(SourceSettings(), SocketSettings(address="127.0.0.1:0"))
     try:
         port = tracker.address.rpartition(":")[2]
         sender = subprocess.run([*command, port], capture_output=True, text=True, timeout=PATIENCE, check=False)

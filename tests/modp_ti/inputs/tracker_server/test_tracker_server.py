@@ -21,7 +21,7 @@ from modp_ti.inputs.protocol import Tracker
 from modp_ti.inputs.readers.colmap import ColmapSettings
 from modp_ti.inputs.readers.socket import SocketSettings
 from modp_ti.inputs.source_settings import SourceSettings
-from modp_ti.inputs.tracker_server import open_tracker_server
+from modp_ti.inputs.tracker_server import TrackerServer
 from tests.modp_ti.inputs.tracker_server.clients import (
     CORRECTION,
     DONE,
@@ -233,7 +233,7 @@ def test_a_closed_server_leaves_nothing_behind(tmp_path: Path) -> None:
 
 def test_an_address_is_of_this_machine_unless_another_is_asked_for() -> None:
     def notes(address: str) -> tuple[str, list[str]]:
-        tracker = open_tracker_server(SourceSettings(), SocketSettings(address=address))
+        tracker = TrackerServer(SourceSettings(), SocketSettings(address=address))
         tracker.close()
         return tracker.address, tracker.notes
 
@@ -245,7 +245,7 @@ def test_an_address_is_of_this_machine_unless_another_is_asked_for() -> None:
 def test_an_address_that_cannot_be_is_refused(tmp_path: Path) -> None:
     def failure(**tracker: object) -> str:
         with pytest.raises(InputError) as caught:
-            open_tracker_server(SourceSettings(), SocketSettings(**tracker))
+            TrackerServer(SourceSettings(), SocketSettings(**tracker))
         assert "\n" not in str(caught.value)
         return str(caught.value)
 
