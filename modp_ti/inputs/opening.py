@@ -10,7 +10,7 @@ from modp_ti.files.file_tree import ARCHIVES, open_tree
 from modp_ti.files.reading import reading
 from modp_ti.inputs.protocol import Progress, Tracker
 from modp_ti.inputs.sources.image_folder import ImageFolder, ListedImages
-from modp_ti.inputs.sources.paced import PacedSource
+from modp_ti.inputs.sources.paced import Pace
 from modp_ti.inputs.sources.panorama import PanoramaFaces, looks_panoramic
 from modp_ti.inputs.sources.protocol import ImageSource
 from modp_ti.inputs.sources.undistortion import given_intrinsics
@@ -56,8 +56,8 @@ def open_source(source: SourceSettings, folder: Path | None = None) -> ImageSour
             images.add_note(f"{path} is read as what `source.kind: {kind}` says", first=True)
     if source.panorama.given:
         return _scaled(PanoramaFaces(images, source.panorama), source)
-    images = _scaled(_with_camera(images, source), source)
-    return PacedSource(images) if source.realtime else images
+    images.pace = Pace() if source.realtime else None
+    return _scaled(_with_camera(images, source), source)
 
 
 def open_tracker(config: Scene, progress: Progress | None = None) -> Tracker:

@@ -1,44 +1,33 @@
-"""`PacedSource`: a recording that is played at the pace of its time stamps."""
+"""`Pace`: a recording is played at the pace of its time stamps."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from threading import Event
 
 import numpy as np
 from numpy.typing import NDArray
 
 from modp_ti.inputs.sources.backlog import Arrivals, Backlog
-from modp_ti.inputs.sources.orientation import Turn
-from modp_ti.inputs.sources.protocol import ImageSource
 
 
-class PacedSource(ImageSource):
-    """A recorded source whose images arrive at the times of their time stamps, the first one at once.
+class Pace:
+    """The arrival of a recording's images at the times of their time stamps, the first one at once.
 
     The clock starts when `arriving` is first asked for an image. Images that arrive faster than they are taken are left
     out evenly, see `Backlog`. If `arriving` is called again, it begins with the same images, without waiting; all calls
     must select the same images.
 
     Args:
-        images: The recorded source, with its camera and scale.
         clock: Monotonic clock [s].
         wait: Waits so many seconds; None to wait until `finish` is called at most.
     """
 
     def __init__(
-        self,
-        images: ImageSource,
-        clock: Callable[[], float] = time.monotonic,
-        wait: Callable[[float], object] | None = None,
+        self, clock: Callable[[], float] = time.monotonic, wait: Callable[[float], object] | None = None
     ) -> None:
-        super().__init__(images.path, images.names, map(images.timestamp, images.names))
-        self.intrinsics = images.intrinsics
-        self.vignette = images.vignette
-        self.T_device_camera = images.T_device_camera
-        self.scale = images.scale
-        self._images = images
         self._clock = clock
         self._finished = Event()
         self._wait = self._finished.wait if wait is None else wait
@@ -48,23 +37,17 @@ class PacedSource(ImageSource):
         self._order: list[str] = []  # the delivered images
         self._received: dict[str, float] = {}  # their times of arrival [s]
 
-    @property
-    def notes(self) -> list[str]:
-        said = f"{self.path} is played at the pace of its time stamps"
-        return [*self._images.notes, *self._notes, said, *self.arrivals.notes(self.path)]
-
-    def arriving(self, start: int, stop: int | None, step: int) -> Iterator[str]:
-        names = self.selected(start, stop, step)
+    def arriving(self, names: Sequence[str], times: Sequence[float]) -> Iterator[str]:
+        """Yield images of these names and times [s] as they arrive."""
         position = 0
-        while position < len(self._order) or self._next(names):
+        while position < len(self._order) or self._next(names, times):
             yield self._order[position]
             position += 1
 
-    def _next(self, names: Sequence[str]) -> bool:
+    def _next(self, names: Sequence[str], times: Sequence[float]) -> bool:
         """Wait for the next image to be tracked and append it to the order. Returns whether there is one."""
         if self._due is None:
-            times = np.array([self.timestamp(name) for name in names])
-            self._due = self._clock() + np.maximum.accumulate(times - times[0])
+            self._due = self._clock() + np.maximum.accumulate(np.subtract(times, times[0]))
         while True:
             now = self._clock()
             while self._come < len(names) and self._due[self._come] <= now and not self._finished.is_set():
@@ -81,39 +64,23 @@ class PacedSource(ImageSource):
 
     @property
     def recording(self) -> bool:
+        """As of `ImageSource`."""
         more = self._due is None or self._come < len(self._due)
         return more and not self._finished.is_set()
 
     @property
     def arrivals(self) -> Arrivals:
+        """Number of images received so far."""
         return self._backlog.arrivals
 
     def arrived(self, name: str) -> float | None:
+        """As of `ImageSource`."""
         return self._received.get(name)
 
     def finish(self) -> None:
+        """Let no more images arrive."""
         self._finished.set()
 
-    # ---- the recording ---------------------------------------------------------------------------------------
-
-    def find(self, name: str) -> str | None:
-        return self._images.find(name)
-
-    def find_all(self, names: Sequence[str]) -> tuple[list[str | None], str | None]:
-        return self._images.find_all(names)
-
-    def size(self, name: str) -> tuple[int, int]:
-        return self._images.size(name)
-
-    def turn(self, name: str) -> Turn:
-        return self._images.turn(name)
-
-    def read(self, name: str) -> NDArray[np.uint8]:
-        return self._images.read(name)
-
-    def valid(self, name: str) -> NDArray[np.bool_] | None:
-        return self._images.valid(name)
-
-    def close(self) -> None:
-        self.finish()
-        self._images.close()
+    def notes(self, source: Path) -> list[str]:
+        """Return remarks on a source of this pace."""
+        return [f"{source} is played at the pace of its time stamps", *self.arrivals.notes(source)]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import PurePosixPath
@@ -200,9 +200,6 @@ class PanoramaFaces(ImageSource):
 
     def selected(self, start: int, stop: int | None, step: int) -> Sequence[str]:
         return [face for name in self._whole.selected(start, stop, step) for face in self.views(name)]
-
-    def arriving(self, start: int, stop: int | None, step: int) -> Iterator[str]:
-        return iter(self.selected(start, stop, step))
 
     def read(self, name: str) -> NDArray[np.uint8]:
         import cv2

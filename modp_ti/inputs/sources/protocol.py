@@ -19,6 +19,7 @@ from modp_ti.inputs.sources.undistortion import Intrinsics
 if TYPE_CHECKING:
     from modp_ti.inputs.capture import Capture
     from modp_ti.inputs.sources.backlog import Arrivals
+    from modp_ti.inputs.sources.paced import Pace
 
 IMAGE_SUFFIXES = (
     *(".jpg", ".jpeg", ".jfif", ".jpe", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm", ".jp2"),
@@ -43,6 +44,7 @@ class ImageSource(ABC):
         T_device_camera: Pose (4, 4) of the camera on a device with other sensors, camera to device, OpenCV axes. None
             for a camera alone.
         scale: Factor from the stored images' width and height to those of the frames, as `source.scale` says.
+        pace: By what the images of a recording arrive, if not when they are asked for.
     """
 
     def __init__(self, path: Path, names: Iterable[str] = (), times: Iterable[float] = ()) -> None:
@@ -52,6 +54,7 @@ class ImageSource(ABC):
         self.capture: Capture | None = None
         self.T_device_camera: NDArray[np.float64] | None = None
         self.scale = 1.0
+        self.pace: Pace | None = None
         self._size: tuple[int, int] | None = None  # (width, height) of every image, where they have one size
         self._notes: list[str] = []
         self._names: list[str] = []
@@ -70,7 +73,7 @@ class ImageSource(ABC):
     @property
     def notes(self) -> list[str]:
         """One-line remarks for the user. A live source may add more by its end."""
-        return self._notes
+        return self._notes if self.pace is None else [*self._notes, *self.pace.notes(self.path)]
 
     @property
     def ending(self) -> str | None:
@@ -153,15 +156,18 @@ class ImageSource(ABC):
 
     def arriving(self, start: int, stop: int | None, step: int) -> Iterator[str]:
         """Yield the names of `selected` as soon as their images are available. Ends when no more will come."""
-        return iter(self.selected(start, stop, step))
+        names = self.selected(start, stop, step)
+        return iter(names) if self.pace is None else self.pace.arriving(names, [*map(self.timestamp, names)])
 
-    def finish(self) -> None:  # noqa: B027 - other sources end by themselves
+    def finish(self) -> None:
         """End the recording of a source that follows a clock. Images that have arrived are still delivered."""
+        if self.pace is not None:
+            self.pace.finish()
 
     @property
     def recording(self) -> bool:
         """Whether images still arrive at a source that follows a clock, so that `finish` has an effect."""
-        return False
+        return self.pace is not None and self.pace.recording
 
     @property
     def kept(self) -> dict[str, dict[str, str | None]]:
@@ -171,11 +177,11 @@ class ImageSource(ABC):
     @property
     def arrivals(self) -> Arrivals | None:
         """Number of images received so far; None for a source that follows no clock."""
-        return None
+        return None if self.pace is None else self.pace.arrivals
 
     def arrived(self, name: str) -> float | None:
         """Return `time.monotonic()` when a delivered image was received [s]; None if the source follows no clock."""
-        return None
+        return None if self.pace is None else self.pace.arrived(name)
 
     @property
     def frame_size(self) -> tuple[int, int]:

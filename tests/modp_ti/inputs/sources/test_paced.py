@@ -11,7 +11,7 @@ import pytest
 from modp_ti.inputs.opening import open_source
 from modp_ti.inputs.source_settings import SourceSettings
 from modp_ti.inputs.sources import ImageFolder
-from modp_ti.inputs.sources.paced import PacedSource
+from modp_ti.inputs.sources.paced import Pace
 
 
 class Clock:
@@ -37,9 +37,10 @@ def folder(tmp_path_factory) -> Path:
     return made
 
 
-def paced(folder: Path, fps: float) -> tuple[PacedSource, Clock]:
-    clock = Clock()
-    return PacedSource(ImageFolder(folder, fps), clock, clock.wait), clock
+def paced(folder: Path, fps: float) -> tuple[ImageFolder, Clock]:
+    clock, images = Clock(), ImageFolder(folder, fps)
+    images.pace = Pace(clock, clock.wait)
+    return images, clock
 
 
 def test_images_arrive_at_the_times_of_their_stamps(folder):
@@ -105,5 +106,5 @@ def test_finish_ends_it_after_what_has_arrived(folder):
 
 def test_the_setting_opens_it_with_the_camera_and_the_scale(folder):
     source = open_source(SourceSettings(path=folder, realtime=True, scale=0.5, intrinsics={"fx": 15.0}))
-    assert isinstance(source, PacedSource)
+    assert isinstance(source.pace, Pace)
     assert (source.intrinsics.camera.fx, source.scale, source.frame_size) == (15.0, 0.5, (16, 12))
