@@ -12,6 +12,7 @@ from pathlib import Path
 import cv2
 import msgpack
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from tests.samples.filmed import OPENGL, Filmed, quaternion, rows_of, write_image, write_scene, write_text
 
@@ -197,20 +198,34 @@ def write_modp(folder: Path, filmed: Filmed) -> None:
     write_scene(folder, "kind: modp", f"path: ., kind: release, {intrinsics(filmed)}")
 
 
+ARIA_MOUNT = np.eye(4)  # T_device_camera
+ARIA_MOUNT[:3, :3] = Rotation.from_euler("xyz", [38, 3, 5], degrees=True).as_matrix()
+ARIA_MOUNT[:3, 3] = [-0.004, -0.012, -0.0044]
+
+
+def aria_calibration(time: int, mount: np.ndarray = ARIA_MOUNT) -> str:
+    """A line of online_calibration.jsonl."""
+    x, y, z, w = quaternion(mount)
+    pose = {"Translation": mount[:3, 3].tolist(), "UnitQuaternion": [w, [x, y, z]]}
+    other = {"Translation": [0, 0, 0], "UnitQuaternion": [1, [0, 0, 0]]}
+    cameras = [
+        {"Label": "camera-slam-left", "T_Device_Camera": other},
+        {"Label": "camera-rgb", "T_Device_Camera": pose},
+    ]
+    return json.dumps({"tracking_timestamp_us": str(time), "CameraCalibrations": cameras})
+
+
 def write_aria(folder: Path, filmed: Filmed) -> None:
-    """The camera looks as the device does."""
     write_images(folder, filmed)
     axes = [f"{axis}_world_device" for axis in ("tx", "ty", "tz", "qx", "qy", "qz", "qw")]
     header = ["graph_uid", "tracking_timestamp_us", "utc_timestamp_ns", *axes, "quality_score"]
-    times, mount = [round(1e6 * i / 30) for i in range(len(filmed.views))], [1.0, [0.0, 0.0, 0.0]]
-    rows, calibrations = [",".join(header)], []
+    times, rows = [round(1e6 * i / 30) for i in range(len(filmed.views))], [",".join(header)]
     for time, view in zip(times, filmed.views, strict=True):
-        pose = [*view.T_world_camera[:3, 3], *quaternion(view.T_world_camera)]
+        T_world_device = view.T_world_camera @ np.linalg.inv(ARIA_MOUNT)
+        pose = [*T_world_device[:3, 3], *quaternion(T_world_device)]
         rows.append(f"g1,{time},0," + ",".join(f"{v:.12g}" for v in pose) + ",1.0")
-        camera = {"Label": "camera-rgb", "T_Device_Camera": {"Translation": [0, 0, 0], "UnitQuaternion": mount}}
-        calibrations.append(json.dumps({"tracking_timestamp_us": str(time), "CameraCalibrations": [camera]}))
     write_text(folder / "closed_loop_trajectory.csv", rows)
-    write_text(folder / "online_calibration.jsonl", calibrations)
+    write_text(folder / "online_calibration.jsonl", list(map(aria_calibration, times)))
     table = ["uid,graph_uid,px_world,py_world,pz_world,inv_dist_std,dist_std"]
     table += [f"{n},g1,{x!r},{y!r},{z!r},0.001,0.01" for n, (x, y, z) in enumerate(filmed.points.tolist())]
     content = gzip.compress(("\n".join(table) + "\n").encode(), mtime=0)

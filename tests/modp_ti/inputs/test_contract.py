@@ -16,7 +16,7 @@ from modp_ti.config.settings import SceneConfig
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.opening import open_source, open_tracker, recognised_kind
 from modp_ti.inputs.readers import READERS
-from tests.opening import CAPTURES, opened
+from tests.opening import CAPTURES, assert_poses, off_pixels, opened
 from tests.samples.captures import WRITERS, zipped
 from tests.samples.kinds import FRAMES, SAMPLES, SIZE, SMALL, write_sample
 
@@ -41,14 +41,13 @@ def every(kinds) -> pytest.MarkDecorator:
     return pytest.mark.parametrize("kind", kinds)
 
 
-def assert_frames(frames, filmed=SMALL, atol: float = 1e-6) -> None:
+def assert_frames(frames) -> None:
     """The frames have the poses of the views, and points on the plane and on their pixels."""
-    for frame, view in zip(frames, filmed.views, strict=True):
-        np.testing.assert_allclose(frame.T_camera_world, view.T_camera_world, atol=atol)
-        p = frame.points.xyz @ frame.T_camera_world[:3, :3].T + frame.T_camera_world[:3, 3]
-        if len(p):
-            assert (p[:, 2] > 0).all()
-            assert np.linalg.norm(frame.camera.project(p) - frame.points.pixels, axis=1).max() < 0.1
+    frames = list(frames)
+    assert_poses(frames, SMALL.views)
+    for frame in frames:
+        if len(frame.points):
+            assert (frame.points.depths(frame.T_camera_world) > 0).all() and off_pixels(frame).max() < 0.1
             assert np.median(np.abs(frame.points.xyz[:, 2])) < 2e-3  # depths are rounded to a millimetre
 
 

@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 import pytest
 
-from modp_ti.inputs import posed_recording
 from modp_ti.inputs.depth_maps import read_millimetres
 from modp_ti.inputs.inspection.conventions import STATED
 from modp_ti.inputs.inspection.geometry import measure_geometry
@@ -16,12 +15,6 @@ from modp_ti.inputs.inspection.survey import survey
 from tests.opening import read_capture
 
 pytestmark = pytest.mark.real_data
-
-
-@pytest.fixture
-def untriangulated(monkeypatch):
-    """The poses alone are looked at."""
-    monkeypatch.setattr(posed_recording, "triangulated_frames", lambda _, frames, *__: frames)
 
 
 def test_points_of_3d_scanner_app_lie_where_another_frame_measures_them(shared_data, opened):
@@ -87,8 +80,7 @@ def test_kitti_drives_forward_as_the_camera_looks(shared_data, tmp_path):
     np.testing.assert_allclose(frames[0].T_camera_world[:3, 3], [0.0597, 0, 0], atol=0.005)
 
 
-def test_cameras_of_tanks_and_temples_look_at_what_they_go_round(shared_data, tmp_path, opened, monkeypatch):
-    monkeypatch.setattr(posed_recording, "triangulated_frames", lambda _, frames, *__: frames)
+def test_cameras_of_tanks_and_temples_look_at_what_they_go_round(shared_data, tmp_path, opened, untriangulated):
     for n in range(151):
         cv2.imwrite(str(tmp_path / f"{n + 1:06d}.png"), np.zeros((36, 64, 3), np.uint8))
     log = shared_data("captures") / "tanksandtemples" / "test.log"

@@ -6,7 +6,7 @@ import msgpack
 import numpy as np
 import pytest
 
-from tests.opening import opened, refusal
+from tests.opening import off_pixels, opened, refusal
 from tests.samples.filmed import write_text
 from tests.samples.kinds import write_sample
 from tests.samples.trackers import stella_map
@@ -48,10 +48,8 @@ def test_frames_between_see_the_landmarks_of_the_keyframes_around_where_they_pro
     write(folder, world)
     tracker = opened(folder)
     for i in (1, 2, 4, 5):
-        frame = tracker.frames[i]
-        p = frame.points.xyz @ frame.T_camera_world[:3, :3].T + frame.T_camera_world[:3, 3]
-        np.testing.assert_allclose(frame.undistorter.camera.project(p), frame.points.pixels, atol=1e-3)
-        assert len(frame.points) >= 20 and 40 not in frame.points.ids
+        points = tracker.frames[i].points
+        assert off_pixels(tracker.frames[i]).max() < 1e-3 and len(points) >= 20 and 40 not in points.ids
     assert any("4 frames between keyframes" in note for note in tracker.notes)
 
 
