@@ -36,7 +36,7 @@ def missing() -> str | None:
 
 
 @contextmanager
-def open_page(url: str, width: int = 1000, height: int = 640) -> Iterator[Page]:
+def open_page(url: str, width: int = 900, height: int = 420) -> Iterator[Page]:
     """Open the viewer's page in a window of this size, and yield it once the scene is shown."""
     from playwright.sync_api import sync_playwright
 

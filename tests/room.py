@@ -19,6 +19,7 @@ from fields.geometry.se3 import inverse_se3
 LOW, HIGH = np.array([-2.5, -2.0, 0.0]), np.array([2.5, 2.0, 2.6])  # corners of the room, z up [m]
 CELLS = np.array([0.7, 0.22])  # cell sizes of the textures [m]
 LIGHT = np.array([0.3, -0.5, 0.81])
+CACHED = 1 << 14  # rays that are shaded together: their arrays stay in a processor's cache
 
 
 def look_at(eye: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -113,9 +114,18 @@ class Room:
 
     def colours(self, eye: NDArray[np.float64], rays: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the colours (N, 3) that rays (N, 3) from `eye` see, about 0 to 1."""
+        return self.shaded(eye, rays)[0]
+
+    def shaded(
+        self, eye: NDArray[np.float64], rays: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return the colours (N, 3) of rays (N, 3) from `eye`, and parameter (N,) and normal (N, 3) of their hits."""
+        if len(rays) > CACHED:
+            parts = [self.shaded(eye, rays[at : at + CACHED]) for at in range(0, len(rays), CACHED)]
+            return tuple(map(np.concatenate, zip(*parts, strict=True)))
         t, which, normal = self.cast(eye, rays)
         colour = self._base[which] + 0.28 * self._texture(eye + t[:, None] * rays + 7.3 * which[:, None])
-        return colour * (0.75 + 0.25 * np.abs(normal @ LIGHT))[:, None]
+        return colour * (0.75 + 0.25 * np.abs(normal @ LIGHT))[:, None], t, normal
 
     def _texture(self, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return smooth noise (N, 3) at points (N, 3), interpolated from lattice values."""
@@ -123,11 +133,13 @@ class Room:
         for lattice, cell in zip(self._lattice, CELLS, strict=True):
             low = np.floor(xyz / cell).astype(np.int64)
             share = xyz / cell - low
-            share = share * share * (3 - 2 * share)
-            for corner in np.ndindex(2, 2, 2):
-                weight = np.where(corner, share, 1 - share).prod(axis=1)
-                i, j, k = ((low + corner) & 31).T
-                found += weight[:, None] * lattice[i, j, k]
+            share = np.ascontiguousarray((share * share * (3 - 2 * share)).T)
+            weights, places = (1 - share, share), (low.T & 31, (low.T + 1) & 31)
+            values = lattice.reshape(-1, 3)
+            for x, y, z in np.ndindex(2, 2, 2):
+                weight = weights[x][0] * weights[y][1] * weights[z][2]
+                place = (places[x][0] * 32 + places[y][1]) * 32 + places[z][2]
+                found += weight[:, None] * values.take(place, axis=0)
         return found
 
 

@@ -24,6 +24,7 @@ output: out
 device: cpu
 mapping: {optimise: {steps: 1}, densify: {pixels: 200, warm_up: 2}}
 refine: {steps: 1}
+export: {report: false}
 """
 
 

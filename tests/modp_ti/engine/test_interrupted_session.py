@@ -8,7 +8,6 @@ import shutil
 import signal
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 
@@ -20,22 +19,25 @@ from modp_ti.files.errors import InputError
 from modp_ti.files.run_folder import appearing
 from modp_ti.outputs.formats.splats_ply import read_splats
 from tests.modp_ti.engine.stopped_runs import Stopper, press_ctrl_c
-
-if TYPE_CHECKING:
-    from tests.room import Room
+from tests.room import Room, RoomRecording, pinhole, walk
 
 SAVED = {".modp-ti", "splats.ply", "trajectory.txt", "frames.json", "colmap", "config.yaml"}
 
 pytestmark = pytest.mark.slow
 
 
-@pytest.fixture
-def scene(tmp_path: Path, room: Room) -> Path:
-    """A walk that is played at its own pace, as a camera would."""
-    from tests.room import RoomRecording, pinhole, walk
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory, room: Room) -> Path:
+    folder = tmp_path_factory.mktemp("recording")
+    RoomRecording(room, pinhole(160, 120), walk(40)).write(folder)
+    return folder
 
+
+@pytest.fixture
+def scene(tmp_path: Path, recording: Path) -> Path:
+    """A walk that is played at its own pace, as a camera would."""
     camera = pinhole(160, 120)
-    RoomRecording(room, camera, walk(40)).write(tmp_path)
+    (tmp_path / "images").symlink_to(recording / "images")
     file = tmp_path / "scene.yaml"
     file.write_text(f"""
 source:  {{path: images, realtime: true, fps: 20, intrinsics: {{fx: {camera.fx}, fy: {camera.fy}, cx: 80, cy: 60}}}}
@@ -157,8 +159,6 @@ def test_the_finished_map_is_there_before_its_scores_and_stays_without_room_for_
 @pytest.fixture
 def recorded(tmp_path: Path, room: Room) -> Path:
     """A short recording with poses, as it can be resumed."""
-    from tests.room import RoomRecording, pinhole, walk
-
     RoomRecording(room, pinhole(64, 48), walk(8)).write(tmp_path)
     file = tmp_path / "scene.yaml"
     file.write_text("""

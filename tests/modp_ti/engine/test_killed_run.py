@@ -95,7 +95,7 @@ def camera(jpegs: list[bytes]) -> Iterator[MjpegCamera]:
         while not stop.is_set():
             for data in jpegs + jpegs[::-1]:
                 made.send_jpeg(data)
-                if stop.wait(0.1):
+                if stop.wait(0.05):
                     break
 
     threading.Thread(target=film, daemon=True).start()
@@ -127,7 +127,7 @@ def test_the_frames_of_another_tracker_survive_a_killed_run(recording: Path, tmp
     (tmp_path / "scene.yaml").write_text("tracker: {kind: socket, path: server}\n" + LIVE)
     run = Run(tmp_path, str(tmp_path / "scene.yaml"))
     script = [sys.executable, str(ROOT / "scripts" / "send_frames.py"), str(recording / "scene.yaml")]
-    options = ["--to", str(tmp_path / "server"), "--late", "1", "--wait", "300", "--rate", "1"]
+    options = ["--to", str(tmp_path / "server"), "--late", "1", "--wait", "300", "--rate", "4"]
     sender = subprocess.Popen([*script, *options], cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     wait_for((tmp_path / "out" / "recording.yaml").exists)
     with Image.open(next((recording / "images").iterdir())) as image:

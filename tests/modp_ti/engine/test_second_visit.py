@@ -45,7 +45,7 @@ source:  {path: images, holdout: 5, fps: 10}
 tracker: {kind: colmap, path: sparse/0}
 output:  out
 device:  cpu
-mapping: {sh_degree: 0, optimise: {steps: 2, last_passes: 1}}
+mapping: {sh_degree: 0, optimise: {steps: 1, last_passes: 0}}
 refine:  {steps: 0}
 export:  {report: true}
 """

@@ -6,8 +6,6 @@ import io
 import json
 import shutil
 from pathlib import Path
-from types import SimpleNamespace
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -22,7 +20,6 @@ from modp_ti.config.scene_file import load_scene
 from modp_ti.engine import session, stages
 from modp_ti.engine.mapper import build_mapper
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.delivered_frames import DeliveredFrames
 from modp_ti.inputs.opening import open_tracker
 from modp_ti.inputs.protocol import Tracker
 from modp_ti.inputs.replay import ReplayedTracker
@@ -31,12 +28,8 @@ from modp_ti.outputs.formats.run_files import read_scores
 from modp_ti.outputs.formats.splats_ply import read_splats
 from modp_ti.outputs.formats.trajectory import read_trajectory
 from modp_ti.outputs.lpips import open_lpips
-from pipelines.pipeline import Stopwatch
 from tests.modp_ti.outputs.report.made_up_run import Page
 from tests.modp_ti.runs import FILES
-
-if TYPE_CHECKING:
-    pass
 
 BESIDE = ["images", "scene.yaml", "sparse"]
 
@@ -243,38 +236,10 @@ class LiveTracker(Tracker):
         self.closed = True
 
 
-class DeafPipeline:
-    """Takes no keyframe."""
-
-    keyframes = ()
-    stopwatch = Stopwatch()
-    renderer = SimpleNamespace(view_renders=0)
-
-    def __init__(self) -> None:
-        self.refused = {}
-
-    def compile(self) -> None: ...
-
-
-class DeafMapper:
-    """Hears no frame."""
-
-    pipeline = DeafPipeline()
-    frames = DeliveredFrames()
-
-    def takes(self, width, height) -> bool:
-        return True
-
-    def take(self, frame) -> None: ...
-
-    def finish(self, progress) -> None: ...
-
-
 def test_a_tracker_is_closed_and_heard_to_its_end_however_the_run_ends(scene, monkeypatch):
     config = load_scene(scene)
     tracker = LiveTracker()
     monkeypatch.setattr(stages, "open_tracker", lambda *_: tracker)
-    monkeypatch.setattr(stages, "build_mapper", lambda *_: DeafMapper())
     said = io.StringIO()
     with pytest.raises(InputError, match="no frame became a keyframe"):
         session.run_scene(config, Console(file=said, width=200))

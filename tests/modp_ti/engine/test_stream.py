@@ -105,6 +105,7 @@ def test_a_run_gives_the_same_map_and_the_same_error_with_and_without(plane_scen
     scene.write_text(
         "source: {path: images, holdout: 4, scale: 0.25}\ntracker: {kind: colmap, path: sparse/0}\noutput: out\n"
         "device: cpu\nmapping: {optimise: {steps: 2}, densify: {pixels: 200}}\nrefine: {steps: 2}\n"
+        "export: {report: false}\n"
     )
     outputs = [run_scene(load_scene(scene, [f"source.prefetch={n}", f"output={tmp_path / str(n)}"])) for n in (0, 3)]
     for name in ("splats.ply", "trajectory.txt", "scores.csv"):

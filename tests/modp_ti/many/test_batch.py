@@ -144,8 +144,9 @@ def test_the_command_says_which_scenes_are_finished_by_its_exit_code(recordings:
 def test_a_fault_after_a_scene_is_finished_is_told(recordings: Path) -> None:
     said = io.StringIO()
     console = Console(file=said, width=200)
+    scenes = read_scenes(scene_files(recordings)[1:2], ["export.report=false", "refine.steps=0"])
     with FaultyPool(recordings / "logs", jobs=1) as pool:
-        results = run_batch(read_scenes(scene_files(recordings)[1:2]), pool, recordings / "batch", console=console)
+        results = run_batch(scenes, pool, recordings / "batch", console=console)
     assert [result.state for result in results] == [State.finished]
     assert "KeyError" in said.getvalue()
 

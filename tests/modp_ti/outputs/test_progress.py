@@ -20,7 +20,6 @@ from modp_ti.outputs.progress import (
     StageProgress,
     TimeAfterMapping,
     TimeLeft,
-    duration,
 )
 from pipelines.pipeline import FrameReport, Pipeline
 
@@ -106,20 +105,6 @@ def test_a_tracker_that_prepares_shows_it_in_place_of_what_is_gone_through() -> 
     assert str(told[-1]).startswith("reading 3/3") and any(one.what == "tracking" for one in told)
 
 
-@pytest.mark.parametrize(
-    ("count", "said"),
-    [(2, "; held-out PSNR 25.00 dB, SSIM 0.900, LPIPS 0.100; fitted PSNR 25.00 dB\n"), (0, ", 1.50 frames/s\n")],
-)
-def test_a_run_without_scores_ends_in_a_line_without_them(count: int, said: str) -> None:
-    scores = dict(zip(("psnr", "ssim", "lpips"), (25.0, 0.9, 0.1) if count else (None, None, None), strict=True))
-    stage = dict.fromkeys(("held_out", "fitted", "all"), scores | {"count": count})
-    metrics = {"frames": 3, "keyframes": 2, "gaussians": 1200, "frames_per_second": 1.5, "refined": None}
-    console = Console(file=io.StringIO(), width=200)
-    ProgressLine(console).summary(metrics | {"online": stage, "offline": None})
-    assert console.file.getvalue().startswith("3 frames, 2 keyframes, 1,200 Gaussians, 1.50 frames/s")
-    assert console.file.getvalue().endswith(said)
-
-
 # ---- the time left -----------------------------------------------------------------------------------------------
 
 
@@ -185,11 +170,3 @@ def test_what_follows_the_last_frame_is_estimated_from_the_recent_views(
     found = after_mapping(costs, frames, every, **settings)
     assert found == (left if left is None else pytest.approx(left * FULL_SIZE))
     assert after_mapping(costs, frames, every, mode="offline") is None
-
-
-@pytest.mark.parametrize(
-    ("seconds", "text"),
-    [(0.2, "0 s"), (40.4, "40 s"), (59.6, "1 min"), (150, "2 min"), (3570, "1 h 0 min"), (4800, "1 h 20 min")],
-)
-def test_durations_are_written_as_a_person_would(seconds: float, text: str) -> None:
-    assert duration(seconds) == text

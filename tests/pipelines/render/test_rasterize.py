@@ -194,7 +194,7 @@ def test_a_gradient_outlives_a_new_start_of_the_engine(anew: None, scene: dict[s
 
 # ---- training -------------------------------------------------------------------------------------------------
 
-STEPS = 500
+STEPS = 300
 SSIM_WEIGHT = 0.2
 
 

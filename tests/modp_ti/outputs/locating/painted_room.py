@@ -40,7 +40,7 @@ def photograph(
     x, y = np.meshgrid(np.arange(fine.width) + 0.5, np.arange(fine.height) + 0.5)
     lens = Undistorter(fine, Distortion(numerator=(k1,)) if k1 else NO_DISTORTION)
     rays = np.c_[lens.rays(np.stack([x.ravel(), y.ravel()], axis=1)), np.ones(x.size)] @ T_camera_world[:3, :3]
-    colour, _, _ = _shaded(room, inverse_se3(T_camera_world)[:3, 3], rays)
+    colour = room.colours(inverse_se3(T_camera_world)[:3, 3], rays)
     colour = colour.reshape(camera.height, 2, camera.width, 2, 3).mean(axis=(1, 3))
     return np.rint(255 * np.clip(colour, 0, 1)).astype(np.uint8)
 
@@ -53,7 +53,7 @@ def painted(room: Room, poses: list[NDArray[np.float64]]) -> dict[str, NDArray[n
     for number, T in enumerate(poses):
         rays = CAMERA.unproject(pixels, np.ones(len(pixels))) @ T[:3, :3]
         eye = inverse_se3(T)[:3, 3]
-        colour, t, normal = _shaded(room, eye, rays)
+        colour, t, normal = room.shaded(eye, rays)
         slant = np.abs((normal * rays).sum(axis=1)) / np.linalg.norm(rays, axis=1)
         width = WIDTH * t / CAMERA.focal / np.maximum(slant, 0.3) ** 0.5
         flat = np.log(np.stack([width, width, 0.05 * width], axis=1))
@@ -92,17 +92,6 @@ def another_room() -> Room:
     room = Room()
     room._base, room._lattice = room._base[::-1].copy(), room._lattice[::-1, ::-1, ::-1].transpose(0, 3, 1, 2, 4).copy()
     return room
-
-
-def _shaded(
-    room: Room, eye: NDArray[np.float64], rays: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Colours (N, 3), parameters (N,) and normals (N, 3) of the hits of rays, as `Room.image` shades them."""
-    from tests.room import LIGHT
-
-    t, which, normal = room.cast(eye, rays)
-    colour = room._base[which] + 0.28 * room._texture(eye + t[:, None] * rays + 7.3 * which[:, None])
-    return colour * (0.75 + 0.25 * np.abs(normal @ LIGHT))[:, None], t, normal
 
 
 def _sees(room: Room, T: NDArray[np.float64], xyz: NDArray[np.float64]) -> NDArray[np.bool_]:

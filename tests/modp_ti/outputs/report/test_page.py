@@ -88,15 +88,6 @@ def test_the_numbers_are_those_of_the_metrics(made) -> None:
     assert sum(widths) == pytest.approx(100, abs=0.1), "bars as long as the stages"
 
 
-def test_a_version_that_knows_no_fitted_frames_has_its_row_beside_one_that_does(tmp_path) -> None:
-    run = made_up_run(tmp_path, frames=9)
-    online = {name: value for name, value in run.metrics["online"].items() if name != "fitted"}
-    page, _ = written(tmp_path, dataclasses.replace(run, metrics={**run.metrics, "online": online}))
-    rows = {row[0]: row[1:] for row in page.tables["numbers"] if row}
-    assert rows["online"][0] == f"{online['held_out']['psnr']:.2f}" and rows["online"][5] == "–"
-    assert rows["refined"][5] == f"{run.metrics['refined']['fitted']['psnr']:.2f}"
-
-
 def test_where_it_is_wrong_stands_in_tables_whose_shares_sum_to_one(made) -> None:
     run, page, _ = made
     assert run.survey.in_words() in page.text
@@ -106,13 +97,6 @@ def test_where_it_is_wrong_stands_in_tables_whose_shares_sum_to_one(made) -> Non
         np.testing.assert_allclose(shown, [[100 * of.pixels, 100 * of.error] for of in bins], atol=0.051)
         np.testing.assert_allclose(shown.sum(axis=0), 100, atol=0.05 * len(bins))
     assert len(page.embedded("wrong", "svg+xml")) == 1
-
-
-def test_without_held_out_frames_the_fitted_ones_are_beside_all(tmp_path) -> None:
-    run = made_up_run(tmp_path, frames=9, holdout=0)
-    page, _ = written(tmp_path, run)
-    rows = {row[0]: row[1:] for row in page.tables["numbers"] if row}
-    assert [rows["refined"][i] for i in (4, 9)] == [str(len(run.keyframes)), "9"]
 
 
 def test_the_curves_are_the_recorded_numbers(made) -> None:

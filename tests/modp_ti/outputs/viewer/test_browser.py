@@ -69,7 +69,7 @@ def wait_until(page, happens) -> None:
 
 def picture(page) -> np.ndarray:
     """The canvas (H, W, 3), left of the controls."""
-    encoded = page.screenshot(clip={"x": 0, "y": 0, "width": 600, "height": 640})
+    encoded = page.screenshot(clip={"x": 0, "y": 0, "width": 520, "height": 420})
     return cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_COLOR).astype(int)
 
 

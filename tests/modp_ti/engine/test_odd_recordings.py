@@ -1,10 +1,13 @@
-"""A map of georeferenced frames is that of the same frames near the origin, and is written in their world."""
+"""Recordings far from the origin, and whose images change while they are mapped."""
 
 from __future__ import annotations
 
+import csv
 import json
+import shutil
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pycolmap
 import pytest
@@ -14,7 +17,10 @@ from fields.frames.origin import far_origin, shifted
 from fields.frames.pose_correction import PoseCorrection
 from fields.geometry.se3 import camera_centres
 from fields.runtime.backend import initialise
+from modp_ti.config.scene_file import load_scene
+from modp_ti.engine import session, stages
 from modp_ti.engine.mapper import Mapper
+from modp_ti.files.errors import InputError
 from modp_ti.inputs.point_cloud import read_ply_points
 from modp_ti.outputs.formats.splats_ply import read_splats
 from modp_ti.outputs.formats.trajectory import read_trajectory
@@ -22,10 +28,14 @@ from modp_ti.outputs.playback.export_map import ExportOptions, export_map
 from modp_ti.outputs.playback.finished_run import open_run
 from modp_ti.outputs.progress import ProgressLine
 from pipelines.settings import MappingSettings
+from tests.fault_injection.recordings import write_recording
+from tests.modp_ti.engine.stopped_runs import Stopper
 from tests.pipelines.wall import CAMERA, frame
 
 SETTINGS = MappingSettings(optimise={"steps": 6}, densify={"warm_up": 2}, depth={"sources": ["image"]})
+
 FAR = np.array([452_001.0, 5_411_000.0, 430.0])
+
 COUNT = 4
 
 
@@ -80,3 +90,69 @@ def test_what_is_written_lies_in_the_world_of_the_frames(maps: tuple[tuple, tupl
 def test_an_ordinary_world_has_no_origin(offset: float) -> None:
     moved = shifted(frame(0), np.full(3, offset))
     assert not far_origin(moved.T_camera_world, moved.points).any()
+
+
+FRAMES = 12
+
+# The last frame is held out, and so changes no map.
+KEEP = ["export.images=true", "source.prefetch=2", "source.holdout=11"]
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("recording")
+    write_recording(folder, FRAMES, 0.25, 2, 0)
+    session.run_scene(load_scene(folder / "scene.yaml", KEEP))
+    return folder
+
+
+def scores(out: Path) -> dict[str, tuple[str, float]]:
+    with (out / "scores.csv").open() as file:
+        return {row["name"]: (row["index"], float(row["psnr"])) for row in csv.DictReader(file)}
+
+
+@pytest.mark.slow
+def test_the_other_frames_keep_their_scores_and_pictures(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Four images are damaged after they were mapped; a fifth was damaged before, and heals."""
+    folder = tmp_path / "meddled"
+    shutil.copytree(recording, folder, ignore=shutil.ignore_patterns("out"))
+    names = [f"{place:06d}.png" for place in (3, 5, 6, 8, 11)]
+    gone, cut, inverted, smaller, healing = (folder / "images" / name for name in names)
+    image, whole = np.asarray(cv2.imread(str(inverted))), healing.read_bytes()
+    healing.write_bytes(whole[:500])
+
+    def meddle() -> None:
+        gone.unlink()
+        cut.write_bytes(cut.read_bytes()[:500])
+        cv2.imwrite(str(inverted), 255 - image)
+        cv2.imwrite(str(smaller), image[:-8])
+        healing.write_bytes(whole)
+
+    monkeypatch.setattr(stages, "open_observer", lambda *_: Stopper("evaluating the saved map", 1, meddle))
+    session.run_scene(load_scene(folder / "scene.yaml", KEEP))
+    expected = scores(recording / "out")
+    for name in names:
+        del expected[name]
+        assert not (folder / "out" / "colmap" / "images" / name).exists()
+    assert scores(folder / "out") == expected
+    for each in expected:
+        images = [place / "out" / "colmap" / "images" / each for place in (folder, recording)]
+        assert images[0].read_bytes() == images[1].read_bytes()
+
+
+@pytest.mark.slow
+def test_without_any_image_there_are_no_scores_but_the_map(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "lost"
+    shutil.copytree(recording, folder, ignore=shutil.ignore_patterns("out"))
+    monkeypatch.setattr(
+        stages,
+        "open_observer",
+        lambda *_: Stopper("evaluating the saved map", 1, lambda: shutil.rmtree(folder / "images")),
+    )
+    with pytest.raises(InputError, match="without its scores"):
+        session.run_scene(load_scene(folder / "scene.yaml", KEEP))
+    assert (folder / "out" / "splats.ply").read_bytes() == (recording / "out" / "splats.ply").read_bytes()

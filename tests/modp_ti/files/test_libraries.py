@@ -1,7 +1,4 @@
-"""pycolmap leaves the terminal, the folder for temporary files and the signals of the process alone.
-
-In processes of their own, as pycolmap is imported once: other tests here import it bare.
-"""
+"""Libraries: one zlib, and no word of pycolmap on the terminal."""
 
 from __future__ import annotations
 
@@ -17,6 +14,33 @@ from tests.patience import PATIENCE
 
 pytestmark = pytest.mark.slow
 
+
+CODE = """
+import {order}
+import gzip, sys, numpy as np, pycolmap, cv2
+from modp_ti.files.atomic import write_picture
+image = np.random.default_rng(0).integers(0, 255, (48, 64, 3), dtype=np.uint8)
+write_picture(sys.argv[1], image)
+assert (cv2.imread(sys.argv[1])[..., ::-1] == image).all()
+assert gzip.decompress(gzip.compress(image.tobytes())) == image.tobytes()
+pycolmap.Bitmap.from_array(image).write(sys.argv[1])
+assert (cv2.imread(sys.argv[1])[..., ::-1] == image).all()
+"""
+
+
+@pytest.mark.parametrize("order", ["pycolmap, cv2, modp_ti", "modp_ti, pycolmap"])
+def test_pictures_are_written_whatever_is_imported_first(order: str, tmp_path) -> None:
+    code = CODE.format(order=order)
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(tmp_path / "picture.png")],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+
+
 TERMINATED = """
 import os, signal, threading, time
 def load():
@@ -26,7 +50,9 @@ def load():
 os.kill(os.getpid(), signal.SIGTERM)
 time.sleep(60)
 """
+
 IN_MAIN = "load()"
+
 IN_THREAD = "thread = threading.Thread(target=load); thread.start(); thread.join()"
 
 # Points so near the cameras that the normal equations have no Cholesky factorization, from an observation that is not

@@ -1,4 +1,4 @@
-"""A recording of which the first tracker places few images is mapped with the second one, if that places more."""
+"""Recordings of which the tracker makes several maps, or of which it places too few images."""
 
 from __future__ import annotations
 
@@ -20,14 +20,58 @@ from modp_ti.engine.session import run_scene
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.readers.klt import KltSettings
 from modp_ti.inputs.readers.sfm import SfmSettings
+from modp_ti.outputs.formats.trajectory import read_trajectory
 from modp_ti.outputs.playback.finished_run import finished_metrics
+from tests.modp_ti.inputs.klt.conftest import BoxRoom, Walk, box_room  # noqa: F401 (a fixture)
+from tests.modp_ti.inputs.klt.conftest import walk as walk_in_the_box
 from tests.room import Room, RoomRecording, pinhole, walk
 
+
+@pytest.fixture
+def two_places(tmp_path: Path, box_room: BoxRoom) -> Path:  # noqa: F811
+    """A place, nothing, and for longer another place."""
+    black = [np.zeros((240, 320, 3), np.uint8)] * 12
+    poses = walk_in_the_box(40)
+    other = map(box_room.mirrored().image, poses[:30])
+    Walk([], [*other, *black, *map(box_room.image, poses)]).written(tmp_path / "images")
+    c = box_room.camera
+    file = tmp_path / "two_places.yaml"
+    file.write_text(f"""
+source:  {{path: images, scale: 0.25, intrinsics: {{fx: {c.fx}, fy: {c.fy}, cx: {c.cx}, cy: {c.cy}}}}}
+tracker: {{kind: klt, maps: all}}
+output:  out
+device:  cpu
+mapping: {{optimise: {{steps: 1, last_passes: 0}}}}
+refine:  {{steps: 0}}
+export:  {{report: false}}
+""")
+    return file
+
+
+@pytest.mark.slow
+def test_the_largest_map_is_the_runs_and_the_other_has_a_folder_in_it(two_places: Path) -> None:
+    output = run_scene(load_scene(two_places))
+    assert output == two_places.parent / "out"
+    frames = {
+        folder: json.loads((folder / "metrics.json").read_text())["frames"] for folder in (output, output / "map-2")
+    }
+    assert list(frames.values()) == [40, 30]
+    assert not (output / "map-3").exists() and not (output / "map-2" / "map-2").exists()
+    for folder, count in frames.items():
+        assert (folder / "splats.ply").is_file() and len(read_trajectory(folder / "trajectory.txt")[0]) == count
+    assert finished_metrics(load_scene(two_places)) is not None, "a batch does not repeat it"
+    again = load_scene(output / "map-2" / "config.yaml")  # which maps this map alone
+    assert getattr(again.tracker, "maps") == 2 and again.output == output / "map-2"  # noqa: B009
+
+
 CAMERA = pinhole(240, 180)
+
 # A few near views of a walk, and then far ones that come back to it from the other end of the room.
 RETURN = [*walk(10, step=0.04), *(walk(61, step=0.05)[i] for i in range(58, 5, -6))]
+
 # Views of a walk, each rolled by 60 degrees against the one before: optical flow finds nothing again.
 ROLL = exp_se3([0, 0, 0, 0, 0, np.radians(60)])
+
 ROLLED = [np.linalg.matrix_power(ROLL, i) @ pose for i, pose in enumerate(walk(6, step=0.2))]
 
 
