@@ -53,13 +53,6 @@ def test_inverse_agrees_with_pycolmap(model):
     np.testing.assert_allclose(ideal, camera.cam_from_img(pixels), atol=1e-7)
 
 
-@pytest.mark.parametrize("model", MODELS)
-def test_inverse_gives_the_point_back(model):
-    distortion = colmap_intrinsics(model, MODELS[model])[4]
-    ideal = grid(0.62, 0.47)
-    np.testing.assert_allclose(distortion.undistort(distortion.distort(ideal), limit=1.5), ideal, atol=1e-8)
-
-
 def test_camera_models_that_are_no_pinhole_are_not_taken_for_one():
     for model in ("SIMPLE_DIVISION", "EUCM", "EQUIRECTANGULAR"):
         assert colmap_intrinsics(model, [1.0] * 16) is None

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import pickle
-import tempfile
 import threading
 
 import numpy as np
 
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
-from modp_ti.inputs.protocol import LiveCounts
 from modp_ti.inputs.sources import Picture
 from modp_ti.inputs.tracking_process import child as module
 from modp_ti.inputs.tracking_process.child import Outbox
-from modp_ti.inputs.tracking_process.exchange import CountsBoard, with_vignette
 from tests.modp_ti.inputs.tracking_process.frames import assert_same, random_frame
 from tests.patience import PATIENCE
 
@@ -57,25 +53,3 @@ def test_the_tracker_waits_only_at_the_limit(monkeypatch):
     thread.join(PATIENCE)
     second, third, last = (outbox.get() for _ in range(3))
     assert (second["index"], third["index"], last.index) == (1, 2, 3)
-
-
-def test_a_frame_keeps_its_pyramid_and_shares_its_vignette():
-    frame = random_frame(1, masked=True)
-    vignette, _ = np.ones((46, 50, 3), np.float32), frame.pyramid
-    got = with_vignette(pickle.loads(pickle.dumps(with_vignette(frame, None))), vignette)
-    assert_same(got, with_vignette(frame, vignette))
-    assert set(vars(got)) >= {"rgba", "pyramid"} and got.pyramid[0].rgba is got.rgba
-    assert got.vignette is vignette and frame.vignette is None
-
-
-def test_the_counts_are_seen_on_the_other_side():
-    with tempfile.TemporaryFile() as file:
-        child, parent = CountsBoard(file.fileno()), CountsBoard(file.fileno())
-    child.write(LiveCounts(arrived=20, tracked=12, thinned=5, lost=1, waiting=0, newest=7.5), 30)
-    assert parent.counts(delivered=9) == LiveCounts(20, 12, 5, 1, waiting=3, newest=7.5)
-    assert parent.frame_count == 30
-    child.write(None, None)
-    assert parent.frame_count is None and parent.counts(0).arrived == 20
-    assert not child.finish
-    parent.finish = True
-    assert child.finish

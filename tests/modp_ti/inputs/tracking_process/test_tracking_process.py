@@ -74,8 +74,11 @@ def wait_until(condition) -> None:
 
 @pytest.mark.parametrize("masked", [False, True])
 def test_it_delivers_what_the_tracker_delivers_in_this_process(scene, started, tmp_path, box_walk, masked):
-    # Dark parts of the images are masked.
-    config = scene(masks=box_walk.written(tmp_path / "masks")) if masked else scene()
+    # Dark parts of the images are masked, and the lens darkens one side.
+    light = np.tile(np.linspace(100, 255, 320).astype(np.uint8), (240, 1))
+    (tmp_path / "light.png").write_bytes(cv2.imencode(".png", light)[1].tobytes())
+    darkened = {"masks": box_walk.written(tmp_path / "masks"), "vignette": tmp_path / "light.png"}
+    config = scene(**darkened) if masked else scene()
     here, there = open_klt(config.source, seed=config.seed), started(config)
     expected, got = list(here), list(there)
     assert masked or sum(isinstance(event, PoseCorrection) for event in expected) > 0
