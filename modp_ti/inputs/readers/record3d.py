@@ -112,16 +112,17 @@ def _read_depth(tree: FileTree, frame: CapturedFrame, size: tuple[Any, ...]) -> 
     if frame.depth.endswith(".exr"):
         metres = _read_exr(tree.read(frame.depth))
         return DepthMap(metres, np.isfinite(metres))
-    data = tree.read(frame.depth)
-    width, height = (
-        size if all(isinstance(side, int) for side in size) else DEPTH_SIZES.get(_claimed(data) // 4, (0, 0))
-    )
-    if not (0 < width <= 1 << 12 and 0 < height <= 1 << 12):
-        raise OSError(0, "its size is not known")
-    metres = np.frombuffer(_unpacked(data, 4 * width * height), "<f4").reshape(height, width)
+    data = _unpacked(tree.read(frame.depth))
+    metres = np.frombuffer(data, "<f4", len(data) // 4)
+    width, height = size if all(isinstance(side, int) for side in size) else DEPTH_SIZES.get(len(metres), (0, 0))
+    if width * height != len(metres) or not len(metres):
+        raise OSError(0, f"it holds {len(metres)} depths instead of {width}x{height}")
+    metres = metres.reshape(height, width)
     confident = np.isfinite(metres)
     if frame.confidence is not None:
-        levels = np.frombuffer(_unpacked(tree.read(frame.confidence), width * height), np.uint8)
+        levels = np.frombuffer(_unpacked(tree.read(frame.confidence)), np.uint8)
+        if len(levels) != metres.size:
+            raise OSError(0, f"{frame.confidence} is of another size")
         confident &= levels.reshape(height, width) >= CONFIDENT
     return DepthMap(metres, confident)
 
@@ -157,42 +158,11 @@ def _exr_size(data: bytes) -> tuple[int, int] | None:
     return right - left + 1, bottom - top + 1
 
 
-def _unpacked(data: bytes, size: int) -> bytes:
-    """Unpack LZFSE data of `size` bytes. Raises OSError if they unpack to another size."""
+def _unpacked(data: bytes) -> bytes:
+    """Unpack LZFSE data."""
     import lzfse  # pyright: ignore[reportMissingImports]  # an extra
 
-    if _claimed(data) != size:
-        raise OSError(0, f"it unpacks to {_claimed(data)} bytes instead of {size}")
     try:
-        unpacked = lzfse.decompress(data)
+        return lzfse.decompress(data)
     except (lzfse.error, MemoryError):  # both for damaged data
         raise OSError(0, "it is damaged") from None
-    if len(unpacked) != size:
-        raise OSError(0, "it is damaged")
-    return unpacked
-
-
-def _claimed(data: bytes) -> int:
-    """Return the size that LZFSE data claim to unpack to, by the headers of their blocks; -1 if they are damaged.
-
-    It is read before anything is unpacked, so that damaged data take no memory.
-    """
-    at = total = 0
-    try:
-        while (magic := data[at : at + 4]) != b"bvx$":
-            (size,) = struct.unpack_from("<I", data, at + 4)
-            total += size
-            if magic == b"bvx-":  # not packed
-                at += 8 + size
-            elif magic == b"bvxn":
-                at += 12 + struct.unpack_from("<I", data, at + 8)[0]
-            elif magic == b"bvx2":  # packed fields: 20 bits from 20 on, 20 bits from 40 on, 32 bits
-                literals, lmd, header = struct.unpack_from("<QQQ", data, at + 8)
-                at += (header & 0xFFFFFFFF) + (literals >> 20 & 0xFFFFF) + (lmd >> 40 & 0xFFFFF)
-                if not header & 0xFFFFFFFF:
-                    return -1
-            else:
-                return -1
-    except struct.error:
-        return -1
-    return total

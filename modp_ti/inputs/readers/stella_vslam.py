@@ -26,13 +26,7 @@ from modp_ti.inputs.sources import Distortion, Intrinsics
 from modp_ti.inputs.timed_poses import TimedPoses, read_trajectory_file
 
 TRAJECTORY = "frame_trajectory.txt"
-# Bounds on lengths stated in the file. The reader allocates an array, including nested ones, when it reads the length,
-# before it has seen the content.
-MAX_ARRAY = 50_000  # the longest arrays are the keypoints of a keyframe
-MAX_TEXT = 4096
-MAX_ITEMS = 20_000_000  # keyframes or landmarks
-MAX_BUFFER = 1 << 26  # bytes of one value
-READ_SIZE = 1 << 20
+MAX_BUFFER = 1 << 26  # bytes of one value, and the longest array
 
 # A frame between keyframes gets the landmarks observed by this many keyframes on either side.
 NEIGHBOURS = 2
@@ -155,29 +149,13 @@ def read_stella_map(path: Path) -> _Map:
             )
         try:
             file.seek(0)
-            _unpacker(file).skip()  # without allocating anything, checks that every stated length has its content
-            file.seek(0)
             return _read(path, file)
         except msgpack.OutOfData:
             raise InputError(f"{path}: the file is cut off; copy it again or let stella_vslam write it again") from None
 
 
-def _unpacker(file: BinaryIO) -> msgpack.Unpacker:
-    return msgpack.Unpacker(
-        file,
-        read_size=READ_SIZE,
-        max_buffer_size=MAX_BUFFER,
-        max_array_len=MAX_ARRAY,
-        max_map_len=MAX_ITEMS,
-        max_str_len=MAX_TEXT,
-        max_bin_len=0,
-        max_ext_len=0,
-        raw=False,
-    )
-
-
 def _read(path: Path, file: BinaryIO) -> _Map:
-    unpacker, world = _unpacker(file), _Map({}, [], {})
+    unpacker, world = msgpack.Unpacker(file, max_buffer_size=MAX_BUFFER), _Map({}, [], {})
     for section in _keys(unpacker):
         if section == "cameras":
             world.cameras.update(

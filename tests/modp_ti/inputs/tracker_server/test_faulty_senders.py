@@ -278,15 +278,6 @@ def waiting_frame(number: int, state: State, points: int = 0) -> Frame:
     return Frame(number, state, float(number), pose, some, b"")
 
 
-def test_frames_that_wait_for_a_pose_are_bounded() -> None:
-    waiting = Ordering()
-    waiting.add_frame(waiting_frame(7, State.LATER))
-    with pytest.raises(ProtocolError, match="FRAME 7"):
-        for number in range(8, 8 + ordering.MAX_WAITING):
-            waiting.add_frame(waiting_frame(number, State.KNOWN))
-    assert list(waiting.ready()) == []
-
-
 def test_points_that_wait_are_bounded_and_counted_off_when_they_go() -> None:
     waiting = Ordering()
     most = ordering.MAX_WAITING_BYTES // (48 * 100_000)

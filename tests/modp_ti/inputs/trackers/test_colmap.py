@@ -86,14 +86,6 @@ def test_images_and_poses_without_the_other_are_skipped_with_a_count(folder, fil
     assert "view8.png" in refusal(folder) and "other0.png" in refusal(folder)
 
 
-def test_a_size_that_does_not_fit_the_intrinsics_is_named_with_the_ratio(folder, filmed):
-    file = folder / "images" / filmed.names[2]
-    image = np.asarray(cv2.imread(str(file)))
-    for size, said in (((160, 120), "source.scale: 0.5"), ((320, 200), "320x200"), ((240, 320), "lies on its side")):
-        cv2.imwrite(str(file), cv2.resize(image, size))
-        assert said in refusal(folder) and filmed.names[2] in refusal(folder)
-
-
 def test_points_behind_the_camera_outside_the_image_or_seen_twice_are_left_out(folder):
     model = pycolmap.Reconstruction(str(folder / "sparse/0"))
     image = next(image for image in model.images.values() if image.name == "view8.png")

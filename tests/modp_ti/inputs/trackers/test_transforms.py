@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -49,18 +48,6 @@ def test_frames_come_in_natural_order_whatever_the_order_and_names_of_the_file(f
     for frame, view in zip(tracker.frames, filmed.views, strict=True):
         np.testing.assert_allclose(frame.T_camera_world, view.T_camera_world, atol=1e-9)
         assert len(frame.points) > 25
-
-
-def test_images_and_frames_without_the_other_are_skipped_with_a_count(folder):
-    gone = [{"file_path": f"images/gone{i}.png", "transform_matrix": np.eye(4).tolist()} for i in range(3)]
-    edit(folder, lambda data: data["frames"].extend(gone))
-    shutil.copy(folder / "images/view8.png", folder / "images/unposed.png")
-    tracker = opened(folder)
-    assert len(tracker) == 7
-    assert tracker.notes[0].startswith("3 frames of transforms.json are not in")
-    assert tracker.notes[1].startswith("1 of 8 images have no pose in transforms.json")
-    edit(folder, frames=gone)
-    assert "gone0.png" in refusal(folder) and "source.path" in refusal(folder)
 
 
 def test_intrinsics_of_a_frame_win_over_those_of_the_file(folder):
