@@ -17,6 +17,7 @@ from fields.map.trajectory import Trajectory
 from fields.runtime.tenancy import in_engine, settled
 from fields.voxels.sparse_bricks import SparseBricks
 from pipelines.companions.companion import Companion
+from pipelines.companions.exposure import ExposureZero
 from pipelines.companions.hidden_gaussians import Contribution, HiddenGaussians
 from pipelines.companions.other_places import OtherPlaces
 from pipelines.companions.pace import CompletePace, Pace
@@ -57,7 +58,8 @@ class OnlineMapper(Pipeline):
     Attributes:
         frame_count: Number of frames processed so far.
         settled: Number of views that `finish` has optimised since the last frame.
-        companions: What the loop calls at fixed places, in order: exposure, paging, places, hidden Gaussians, masks.
+        companions: What the loop calls at fixed places, in order: exposure, its zero, paging, places, hidden
+            Gaussians, masks.
 
     Example:
         mapper = modp_ti.OnlineMapper(modp_ti.MappingSettings(), max_width=640, max_height=480, seed=0)
@@ -99,7 +101,14 @@ class OnlineMapper(Pipeline):
             self.paging = Paging(self.gaussians, self.keyframes, self.budget, settings, folder)
             contribution = Contribution(self.gaussians, self.renderer)
             self.hidden = HiddenGaussians(contribution, self.densifier, self.paging, settings.densify.min_contribution)
-            self.companions += [self.optimiser.exposure, self.paging, OtherPlaces(self.densifier), self.hidden]
+            self.zero = ExposureZero(self.keyframes, self.gaussians, self.paging)
+            self.companions += [
+                self.optimiser.exposure,
+                self.zero,
+                self.paging,
+                OtherPlaces(self.densifier),
+                self.hidden,
+            ]
             if settings.transients:
                 self.transients = TransientSweep(self.gaussians, self.keyframes, self.renderer, self.paging)
                 self.companions.append(self.transients)

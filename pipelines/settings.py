@@ -241,7 +241,9 @@ class ExposureSettings(StrictModel):
     )
     learning_rate: float = Field(default=0.005, ge=0, description="Adam step of A (3x3) and b")
     regularisation: float = Field(
-        default=0.03, ge=0, description="weight of |A - I|^2 + |b|^2 of a keyframe beside its loss"
+        default=0.03,
+        ge=0,
+        description="weight of |A - gain I|^2 + |b|^2 of a keyframe beside its loss, with its mean gain",
     )
 
 

@@ -38,6 +38,7 @@ def warm_up(mapper: OnlineMapper) -> None:
         optimiser.exposure.new_keyframe(store, renderer, settings.near)
         if settings.exposure.enabled:
             first.exposure = view.exposure = np.array(IDENTITY)
+            mapper.zero.motion.recolour(np.ones(3), np.zeros(3))
         optimiser.step(store, [1], optimiser.rates(1.0), pose_rate=0.0)
         optimiser.settle()
         optimiser.exposure.moments.forget(view.index)

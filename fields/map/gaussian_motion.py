@@ -1,11 +1,11 @@
-"""`GaussianMotion`: moves Gaussians with the views that placed them, after a tracker has revised their poses."""
+"""`GaussianMotion`: moves Gaussians with the views that placed them, and changes the colours of all."""
 # pyright: reportGeneralTypeIssues=false, reportInvalidTypeForm=false, reportOperatorIssue=false, reportOptionalSubscript=false
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fields.geometry.se3 import quaternion_from_matrix, scale_of
-from fields.map.gaussians import GaussianField
+from fields.map.gaussians import SH_C0, GaussianField
 from fields.runtime.engine import ti
 
 TABLE = ti.types.ndarray(ndim=2)
@@ -14,7 +14,7 @@ BLOCKS = ti.types.ndarray(ndim=3)
 
 @ti.data_oriented
 class GaussianMotion:
-    """Applies one similarity per anchor to the anchor's Gaussians: position, rotation, scale and harmonics.
+    """Applies one similarity per anchor to the anchor's Gaussians (position, rotation, scale, harmonics).
 
     Adam's moments are transformed as well, so that optimisation continues as if the Gaussian had always been at its new
     place. If a value changes by y = M x, its gradient changes by M^-T. First moments are multiplied by M^-T, and second
@@ -70,6 +70,24 @@ class GaussianMotion:
         """
         self._place(first, np.ascontiguousarray(position, dtype=self.gaussians.dtype), float(np.log(growth)))
         self.gaussians.clear_gradients()
+
+    def recolour(self, gain: NDArray[np.float64], offset: NDArray[np.float64], first: int = 0) -> None:
+        """Turn the colours of the Gaussians from `first` on into gain (3,) colour + offset (3,), between steps."""
+        if self.gaussians.count > first:
+            table = np.ascontiguousarray([gain, offset], dtype=self.gaussians.dtype)
+            self._recolour(first, self.gaussians.count, table)
+
+    @ti.kernel
+    def _recolour(self, first: ti.i32, end: ti.i32, table: TABLE):
+        for i in range(first, end):
+            for c in ti.static(range(3)):
+                g = table[0, c]
+                for k in range(self.gaussians.sh_count):
+                    self.gaussians.sh[i, k][c] *= g
+                    self.gaussians.sh_m[i, k][c] /= g
+                    self.gaussians.sh_v[i, k][c] /= g * g
+                # The colour is 0.5 + C0 sh_0 + ...
+                self.gaussians.sh[i, 0][c] += (0.5 * (g - 1.0) + table[1, c]) / SH_C0
 
     @ti.kernel
     def _place(self, first: ti.i32, position: TABLE, growth: ti.f32):

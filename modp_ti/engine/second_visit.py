@@ -193,6 +193,7 @@ class SecondVisit(EarlierMap):
 
     def recall(self, mapper: Mapper) -> None:
         map_, earlier = mapper.online, EarlierVisit(self._run.gaussians, len(self._run))
+        map_.companions.remove(map_.zero)  # the earlier map, which later views are compared with, keeps its brightness
         map_.companions.append(ChangeSweep(earlier, map_.gaussians, map_.keyframes, map_.renderer, map_.paging))
 
 

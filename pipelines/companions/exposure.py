@@ -1,4 +1,4 @@
-"""Exposure of keyframes: whether the light changes, the first fit, and refinement by Adam."""
+"""Exposure of keyframes: whether the light changes, the first fit, refinement by Adam, and the zero of all."""
 
 from __future__ import annotations
 
@@ -6,9 +6,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from fields.map.gaussian_motion import GaussianMotion
+from fields.map.gaussians import GaussianField
 from fields.map.keyframe import Keyframe
 from fields.map.keyframes import KeyframeStore
 from pipelines.companions.companion import Companion
+from pipelines.companions.paging import Paging
 from pipelines.optimise.adam import Moments
 from pipelines.render.formulas import IDENTITY
 from pipelines.render.renderer import Renderer
@@ -202,7 +205,7 @@ class ExposureRefinement(Companion):
         view.exposure = np.column_stack([np.diag(gains), np.zeros(3)])
 
     def step(self, view: Keyframe, gradient: NDArray[np.float64], weight: float = 1.0) -> None:
-        """Make one Adam step on the exposure of a keyframe, with the regularisation towards the identity.
+        """Make one Adam step on the exposure of a keyframe, with the regularisation towards a plain gain.
 
         A step with a gradient that is not finite is skipped.
 
@@ -215,5 +218,59 @@ class ExposureRefinement(Companion):
             self.safeguards.exposure_steps += 1
             return
         exposure = IDENTITY if view.exposure is None else view.exposure
-        gradient = gradient + 2.0 * weight * self.settings.regularisation * (exposure - IDENTITY)
+        pull = exposure - np.diagonal(exposure).mean() * IDENTITY
+        gradient = gradient + 2.0 * weight * self.settings.regularisation * pull
         view.exposure = exposure - self.moments.step(view.index, gradient, self.settings.learning_rate)
+
+
+# Change of the map's colours that is not made: blocks on disk would be written again for it.
+NEGLIGIBLE = 0.005
+
+
+class ExposureZero(Companion):
+    """Holds the interquartile means of the keyframes' log gains and offsets at zero, in each channel.
+
+    Exposures and the map's colours share a gain g and an offset h, since A colour + b = (A / g) (g colour + h) + b -
+    (A / g) h. The first keyframe decides them as it begins with the identity: a dark first image would darken the
+    whole map. A plain mean would follow it, and a median jump where few keyframes differ: on desk, such an image moves
+    them by 4 % and 3 %, this one by 1 %. Renders of keyframes stay the same where they are opaque. Nothing happens
+    while a keyframe has no exposure.
+
+    Args:
+        keyframes: The keyframes of the map.
+        gaussians: The Gaussians in memory.
+        paging: Keeps the part of the map that is on disk.
+    """
+
+    def __init__(self, keyframes: KeyframeStore, gaussians: GaussianField, paging: Paging) -> None:
+        self.keyframes = keyframes
+        self.paging = paging
+        self.motion = GaussianMotion(gaussians)
+
+    def new_keyframe(self, store: KeyframeStore, renderer: Renderer, near: float) -> None:
+        self.hold()
+
+    def before_passes(self, places: NDArray[np.int64], near: float) -> None:
+        self.hold()
+
+    def hold(self) -> None:
+        """Move the zero to the middle of the keyframes. Call it between steps."""
+        found = [view.exposure for view in self.keyframes if view.exposure is not None]
+        if len(found) < max(len(self.keyframes), 1):
+            return
+        exposures = np.array(found)
+        gain = np.exp(_middle(np.log(np.maximum(np.diagonal(exposures, axis1=1, axis2=2), DARK))))
+        offset = _middle(exposures[:, :, 3])
+        if max(np.abs(gain - 1.0).max(), np.abs(offset).max()) <= NEGLIGIBLE:
+            return
+        A = exposures[:, :, :3] / gain
+        for view, exposure in zip(self.keyframes, np.dstack([A, exposures[:, :, 3] - A @ offset]), strict=True):
+            view.exposure = exposure
+        self.motion.recolour(gain, offset)
+        self.paging.rewrite(lambda first: self.motion.recolour(gain, offset, first))
+
+
+def _middle(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Interquartile mean (3,) of values (K, 3)."""
+    cut = len(values) // 4
+    return np.sort(values, axis=0)[cut : len(values) - cut].mean(axis=0)

@@ -99,8 +99,8 @@ class MapOptimiser:
     ) -> float:
         """Make Adam steps on the views, one for each batch.
 
-        Updates the Gaussians, the errors of the keyframes, their poses and, where estimated, their exposures. Pose and
-        exposure of the first keyframe are fixed, and those of the first one of each further place. On a GPU, the host
+        Updates the Gaussians, the errors of the keyframes, their poses and, where estimated, their exposures. The pose
+        of the first keyframe is fixed, and pose and exposure of the first one of each further place. On a GPU, the host
         does not wait for the device: errors and PSNR lag by one step (NaN at first), and a pose is updated before its
         keyframe is rendered again. `settle` applies all pending results.
 
@@ -172,7 +172,7 @@ class MapOptimiser:
             begins = j == 0 or view.index in store.begins
             if pose_rate > 0 and not begins:
                 pose_gradients.setdefault(j, []).append(self.renderer.async_camera_gradient())
-            if view.exposure is not None and not begins:
+            if view.exposure is not None and view.index not in store.begins:
                 exposure_gradients.setdefault(j, []).append(self.renderer.async_exposure_gradient())
         self.aspect.backward(o.aspect_weight, store.scene_depth)
         rendered = [view for view, _ in seen]

@@ -246,3 +246,20 @@ def test_gradients_of_what_moves_are_dropped(motion: GaussianMotion, states) -> 
 def test_an_anchor_without_a_motion_is_refused(motion: GaussianMotion, states) -> None:
     with pytest.raises(ValueError, match="anchor 3"):
         motion.move(S[:3], SH_TURN[:3])
+
+
+def test_recoloured_gaussians_have_gain_times_colour_plus_offset_from_every_side(
+    states, motion: GaussianMotion
+) -> None:
+    gain, offset = np.array([2.0, 0.5, 1.25]), np.array([0.1, 0.0, -0.2])
+    before = motion.gaussians.to_numpy() | moments(motion.gaussians)
+    motion.recolour(gain, offset, first=20)
+    after = motion.gaussians.to_numpy() | moments(motion.gaussians)
+    directions = np.random.default_rng(4).normal(size=(5, 3))
+    basis = sh_basis(DEGREE, directions / np.linalg.norm(directions, axis=1, keepdims=True))
+    colours, changed = (0.5 + np.einsum("dk,nkc->ndc", basis, state["sh"]) for state in (before, after))
+    np.testing.assert_allclose(changed[:20], colours[:20])
+    np.testing.assert_allclose(changed[20:], colours[20:] * gain + offset, atol=1e-5)
+    # A gradient with respect to g x is that with respect to x, divided by g.
+    np.testing.assert_allclose(after["sh_m"][20:], before["sh_m"][20:] / gain, rtol=1e-5)
+    np.testing.assert_allclose(after["sh_v"][20:], before["sh_v"][20:] / gain**2, rtol=1e-5)
