@@ -61,7 +61,7 @@ def _options(
 EXAMPLES = {"run": run.EXAMPLES, "batch": batch.EXAMPLES, **finished.EXAMPLES, **input.EXAMPLES}
 for command in (
     *(run.run, batch.batch, finished.refine, input.cameras, input.check),
-    *(finished.render, finished.export, finished.locate, finished.view, input.warmup),
+    *(finished.render, finished.export, finished.measure, finished.locate, finished.view, input.warmup),
 ):
     app.command(epilog=EXAMPLES[command.__name__])(command)
 

@@ -1,4 +1,4 @@
-"""What is done with a finished run: `modp-ti render`, `export`, `view`, `locate` and `refine`.
+"""What is done with a finished run: `modp-ti render`, `export`, `view`, `measure`, `locate` and `refine`.
 
 Imports are made in the commands, so that `--help` does not wait for Taichi and the readers to load.
 """
@@ -43,6 +43,10 @@ EXAMPLES = {
     ),
     "view": examples(
         "modp-ti view out/room", "modp-ti view splats.ply", "modp-ti view out/room --port 0 --max-splats 1000000"
+    ),
+    "measure": examples(
+        "modp-ti measure out/room 120,200@40 310,190@40   (a length in frame 40)",
+        "modp-ti measure out/room 12,20@3 60,20@3 60,45@8   (and an area)",
     ),
     "locate": examples(
         "modp-ti locate out/room new.jpg",
@@ -207,6 +211,41 @@ def view(
             pass
         finally:
             viewer.close()
+
+
+def measure(
+    out: Out,
+    points: Annotated[
+        list[str],
+        typer.Argument(metavar="X,Y@FRAME", help="pixels of frames as mapped (those of `render`), from the top left"),
+    ],
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+) -> None:
+    """Measure between points of the surface, each chosen as a pixel of a frame: length, and area of three or more.
+
+    The surface lies at the median depth of the map. A deviation follows each number: that of the map's depth, and half
+    a pixel.
+    """
+    with outcome(as_json) as result:
+        from modp_ti.outputs.measuring import area, described, length, point_at
+
+        run, _ = _opened(out, quiet)
+        found = [point_at(run, point) for point in points]
+        spans = {"length": length(found)} if len(found) > 1 else {}
+        spans |= {"area": area(found)} if len(found) > 2 else {}
+        coordinates = (" ".join(f"{x:.6g}" for x in point.xyz + run.record.origin) for point in found)
+        lines = [
+            f"{name}: {at} \u00b1 {p.deviation:.2g}" for name, at, p in zip(points, coordinates, found, strict=True)
+        ]
+        result.text = "\n".join([*lines, described(found)]).strip()
+        result.data = {
+            "points": [
+                {"xyz": (point.xyz + run.record.origin).tolist(), "covariance": point.covariance.tolist()}
+                for point in found
+            ],
+            **{name: {"value": value, "deviation": spread} for name, (value, spread) in spans.items()},
+        }
 
 
 def locate(

@@ -64,6 +64,13 @@ def _camera_fits(content: dict[str, Any]) -> bool:
     return len(content) == 1 + len(CAMERA) and bool((abs(numbers) <= FARTHEST).all()) and min(sides) >= 0
 
 
+def _click_fits(content: dict[str, Any]) -> bool:
+    """Whether a browser can have clicked there."""
+    click = msgspec.convert(content, _messages.ScenePointerMessage)
+    numbers = np.hstack([click.ray_origin, click.ray_direction, *click.screen_pos])  # pyright: ignore - or raises
+    return click.event_type == "click" and bool((abs(numbers) <= FARTHEST).all()) and any(numbers[3:6])
+
+
 def _update_fits(content: dict[str, Any], control: Any) -> bool:
     """Whether a control can have the value."""
     value = content["updates"]["value"]
@@ -110,6 +117,7 @@ class Door:
         host: Address to listen on.
         port: Port to listen on. If it is taken, the next free one is used; 0 picks any free port.
         title: Title of the page's panel.
+        takes_clicks: Whether clicks into the scene are accepted.
 
     Attributes:
         server: viser's server.
@@ -122,14 +130,14 @@ class Door:
 
     _opening = threading.Lock()
 
-    def __init__(self, host: str, port: int, title: str) -> None:
+    def __init__(self, host: str, port: int, title: str, takes_clicks: bool = False) -> None:
         self._host, self._socket = host, _listening(host, port)
         self.port = self._socket.getsockname()[1]
         self._token = secrets.token_urlsafe(24)
         self.url = f"http://{f'[{host}]' if ':' in host else host}:{self.port}/{self._token}/"
         self.connections: set[_Connection] = set()
         self._controls: WeakValueDictionary[str, Any] = WeakValueDictionary()
-        self._guarded = False
+        self._guarded, self._takes_clicks = False, takes_clicks
         parts = SimpleNamespace(
             asyncio=SimpleNamespace(server=SimpleNamespace(serve=self._serve)),
             datastructures=websockets.datastructures,
@@ -180,7 +188,9 @@ class Door:
             fits = _camera_fits(content)
         elif content["type"] == "GuiUpdateMessage" and content["uuid"] in self._controls:
             fits = _update_fits(content, self._controls[content["uuid"]])
-        else:  # none of our page: pointers, forms, commands, uploads, the tunnel
+        elif content["type"] == "ScenePointerMessage" and self._takes_clicks:
+            fits = _click_fits(content)
+        else:  # none of our page: other pointers, forms, commands, uploads, the tunnel
             return False
         if not fits:
             raise ValueError("out of range")

@@ -15,6 +15,7 @@ from fields.geometry.se3 import camera_centres, inverse_se3, quaternion_from_mat
 from modp_ti.files.errors import InputError
 from modp_ti.outputs.viewer.handover import BrowserCamera, Gate, Requests
 from modp_ti.outputs.viewer.modes import MODES, SPLATS, Splats, frustum_lines, scale_of
+from modp_ti.outputs.viewer.tape import Pick, Tape
 
 if TYPE_CHECKING:
     import viser
@@ -53,13 +54,14 @@ class Browser:
         client: viser's handle of the browser.
         modes: Display modes to choose from. The first one is shown first.
         frames: Number of frames to choose from; 0 for no choice.
+        pick: Finds the points between which it measures, or None.
 
     Attributes:
         nodes: The nodes of this browser alone, by name.
         chosen: The frame that this browser has chosen; None while it shows that of all browsers.
     """
 
-    def __init__(self, client: viser.ClientHandle, modes: Sequence[str], frames: int) -> None:
+    def __init__(self, client: viser.ClientHandle, modes: Sequence[str], frames: int, pick: Pick | None) -> None:
         gui = client.gui
         self.client = client
         self.slider = gui.add_slider("Frame", 0, max(frames - 1, 1), 1, 0) if frames else None
@@ -67,6 +69,7 @@ class Browser:
         self._scale = gui.add_html("", visible=False)
         self._note = gui.add_markdown("")
         self.boxes = {name: gui.add_checkbox(label, initial_value=True) for name, label in LABELS.items()}
+        self.tape = Tape(client, pick, self.note) if pick is not None else None
         self.look = gui.add_button("Look from the current frame")
         self.link = gui.add_button("Link to this view")
         self.nodes: dict[str, Any] = {}
@@ -76,7 +79,9 @@ class Browser:
     @property
     def controls(self) -> list[Any]:
         """The controls that the browser may change."""
-        return [self.mode, *self.boxes.values(), self.look, self.link, *([self.slider] if self.slider else [])]
+        optional = [self.slider, self.tape.box if self.tape is not None else None]
+        always = [self.mode, *self.boxes.values(), self.look, self.link]
+        return always + [control for control in optional if control is not None]
 
     @property
     def camera(self) -> BrowserCamera:
@@ -129,6 +134,7 @@ class Page:
         modes: Display modes to choose from. The first one is shown first.
         choose: Called with a browser's id and the frame's position that it chooses, None for a page without slider.
         frames: Number of frames of the slider.
+        pick: Finds the points between which browsers measure, None for a page without measuring.
 
     Attributes:
         requests: The pictures that browsers need.
@@ -147,6 +153,7 @@ class Page:
         modes: Sequence[str] = MODES,
         choose: Callable[[int, int], None] | None = None,
         frames: int = 0,
+        pick: Pick | None = None,
     ) -> None:
         try:
             import viser  # noqa: F401
@@ -159,7 +166,7 @@ class Page:
             ) from None
         self.requests = Requests()
         self._gate = gate
-        self._modes, self._choose, self._frames = modes, choose, frames
+        self._modes, self._choose, self._frames, self._pick = modes, choose, frames, pick
         self._units: float | None = None
         self._frame: ShownFrame | None = None  # of the browsers that have chosen none
         self._nodes: dict[str, Any] = {}  # those of all browsers
@@ -168,7 +175,7 @@ class Page:
         self._drawn = ""  # how many of the Gaussians all browsers draw
         self._lock = threading.RLock()  # nodes are changed by the publishing thread and by viser's threads
         before = set(threading.enumerate())
-        self._door = Door(host, port, TITLE)
+        self._door = Door(host, port, TITLE, takes_clicks=pick is not None)
         self._server = self._door.server
         self.threads = [thread for thread in threading.enumerate() if thread not in before]
         self.url = self._door.url
@@ -330,7 +337,7 @@ class Page:
 
     def _connected(self, client: viser.ClientHandle) -> None:
         number = client.client_id
-        browser = Browser(client, self._modes, self._frames if self._choose else 0)
+        browser = Browser(client, self._modes, self._frames if self._choose else 0, self._pick)
 
         def on(register: Callable[[Callable[[Any], None]], Any], act: Callable[[], None]) -> None:
             register(lambda _: self.attempt(number, act))
@@ -344,6 +351,8 @@ class Page:
         on(browser.mode.on_update, lambda: self._set_mode(browser))
         for box in browser.boxes.values():
             on(box.on_update, lambda: self._moved(browser))
+        if (tape := browser.tape) is not None:
+            on(tape.box.on_update, lambda: tape.set(self.units, lambda act: self.attempt(number, act)))
         on(browser.look.on_click, lambda: self._look_from_frame(browser))
         on(browser.link.on_click, lambda: browser.note(f"[This view]({self.url}{browser.link_to_view})"))
         on(client.camera.on_update, lambda: self._moved(browser))

@@ -21,6 +21,7 @@ from zstandard import ZstdDecompressor
 
 from fields.geometry.camera import PinholeCamera
 from modp_ti.files.errors import InputError
+from modp_ti.outputs.measuring import SurfacePoint
 from modp_ti.outputs.viewer.handover import Gate
 from modp_ti.outputs.viewer.modes import Splats
 from modp_ti.outputs.viewer.page import Page
@@ -30,6 +31,11 @@ CAMERA = PinholeCamera(100.0, 100.0, 60.0, 40.0, 120, 80)
 PROTOCOL = f"viser-v{viser.__version__}"
 
 
+def at_the_tip(origin: np.ndarray, ray: np.ndarray, pixel: float) -> SurfacePoint | None:
+    """A surface where rays of length one end, and none behind."""
+    return SurfacePoint(origin + ray, np.zeros((3, 3))) if ray[2] > 0 else None
+
+
 @pytest.fixture
 def gate() -> Gate:
     return Gate()
@@ -37,7 +43,7 @@ def gate() -> Gate:
 
 @pytest.fixture
 def page(gate: Gate) -> Iterator[Page]:
-    page = Page("127.0.0.1", 0, gate, choose=lambda client, frame: None, frames=5)
+    page = Page("127.0.0.1", 0, gate, choose=lambda client, frame: None, frames=5, pick=at_the_tip)
     yield page
     page.close()
 
@@ -78,6 +84,11 @@ def camera(**changed: Any) -> bytes:
 
 def put(uuid: str, value: Any) -> bytes:
     return message("GuiUpdateMessage", uuid=uuid, updates={"value": value})
+
+
+def click(**changed: Any) -> bytes:
+    where = {"ray_origin": [0.0, 0, 0], "ray_direction": [0.0, 0, 1], "screen_pos": [[0.5, 0.5]]}
+    return message("ScenePointerMessage", **({"event_type": "click", "modifier": None} | where | changed))
 
 
 def heard(browser: ClientConnection, until: Callable[[dict], bool]) -> dict:
@@ -189,6 +200,10 @@ HOSTILE: dict[str, Callable[[dict[str, str]], bytes | str]] = {
     "canvas": lambda c: camera(image_width=1 << 40),
     "canvas below nothing": lambda c: camera(image_height=-1),
     "another field": lambda c: camera(owner=3),
+    "drawn rectangle": lambda c: click(event_type="rect-select"),
+    "click of text": lambda c: click(ray_origin=["a", 0, 0]),
+    "click, not finite": lambda c: click(ray_direction=[0.0, 0, float("inf")]),
+    "click at nothing": lambda c: click(ray_direction=None),
     "upload": lambda c: message(
         "FileTransferStartUpload",
         source_component_uuid=c["Frame"],
@@ -286,6 +301,19 @@ def test_each_browser_has_its_own_mode_and_frame():
         other.close()
     finally:
         page.close()
+
+
+def test_a_browser_measures_between_its_clicks(page: Page):
+    page.settle(2.0, np.eye(4), CAMERA)
+    browser, controls = entered(page)
+    browser.send(put(controls["Measure"], True))
+    heard(browser, lambda m: "ScenePointer" in m["type"])
+    for ray in ([0.0, 0, 1], [0.0, 0, -1], [0.0, 0.75, 1]):  # the second meets nothing
+        browser.send(click(ray_direction=ray))
+    assert "0.75" in heard(browser, lambda m: m["type"] == "LabelMessage")["props"]["text"]
+    browser.send(put(controls["Measure"], False))
+    heard(browser, lambda m: m["type"] == "RemoveSceneNodeMessage" and m["name"] == "/measured")
+    browser.close()
 
 
 def test_a_browser_gets_splats_of_its_own_and_the_first_view_is_that_of_the_camera(page: Page):
