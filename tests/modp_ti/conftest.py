@@ -112,6 +112,14 @@ def finished(made_once: Callable[[str, Callable[[Path], None]], Path], room_reco
     return made_once(SHORT_RUN, fill) / "out"
 
 
+@pytest.fixture(scope="module")
+def without_warm_up():
+    """Runs in this process compile kernels as they come, which takes a fifth less. A warm-up changes no map."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("pipelines.online.warm_up", lambda _: None)
+        yield
+
+
 @pytest.fixture
 def interruptible():
     """Signals as in a shell's foreground: in the background, Ctrl-C may be ignored, and under nohup SIGHUP is."""

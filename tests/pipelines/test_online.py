@@ -14,7 +14,7 @@ from pipelines.refinement import in_steps, refine
 from pipelines.settings import MappingSettings, RefineSettings
 from tests.pipelines.wall import CAMERA, frame, on_the_plane, pose
 
-SETTINGS = MappingSettings(optimise={"steps": 20}, densify={"warm_up": 2})
+SETTINGS = MappingSettings(optimise={"steps": 10}, densify={"warm_up": 2})
 
 pytestmark = pytest.mark.slow
 

@@ -32,6 +32,8 @@ from tests.fault_injection.recordings import write_recording
 from tests.modp_ti.engine.stopped_runs import Stopper
 from tests.pipelines.wall import CAMERA, frame
 
+pytestmark = pytest.mark.usefixtures("without_warm_up")
+
 SETTINGS = MappingSettings(optimise={"steps": 6}, densify={"warm_up": 2}, depth={"sources": ["image"]})
 
 FAR = np.array([452_001.0, 5_411_000.0, 430.0])

@@ -23,6 +23,8 @@ from tests.modp_ti.engine.stopped_runs import kill, press_ctrl_c, resumed_run, s
 from tests.modp_ti.engine.test_session import psnr_of_pictures
 from tests.room import Room, RoomRecording, pinhole, walk
 
+pytestmark = pytest.mark.usefixtures("without_warm_up")
+
 # Exposure and pruning; corrections come from klt, below: all that a snapshot must hold.
 SCENE = """
 source:  {path: images, holdout: 4, fps: 10}

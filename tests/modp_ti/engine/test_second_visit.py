@@ -28,7 +28,7 @@ from tests.modp_ti.engine.stopped_runs import kill, resumed_run, stopped_run
 from tests.modp_ti.outputs.locating.painted_room import CAMERA, another_room, write_run
 from tests.room import Room, RoomRecording, walk, write_colmap
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("without_warm_up")]
 
 # Where the first visit's map lies in its world, and the second tracker's room in its: both are georeferenced.
 ORIGIN, AWAY_FROM_ORIGIN = np.array([452_000.0, 5_411_000.0, 430.0]), np.eye(4)

@@ -26,6 +26,8 @@ from tests.modp_ti.inputs.klt.conftest import BoxRoom, Walk, box_room  # noqa: F
 from tests.modp_ti.inputs.klt.conftest import walk as walk_in_the_box
 from tests.room import Room, RoomRecording, pinhole, walk
 
+pytestmark = pytest.mark.usefixtures("without_warm_up")
+
 
 @pytest.fixture
 def two_places(tmp_path: Path, box_room: BoxRoom) -> Path:  # noqa: F811

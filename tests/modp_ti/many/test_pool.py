@@ -133,7 +133,7 @@ def test_no_more_tasks_run_at_a_time_than_the_machine_has_room_for(
 
 @pytest.mark.slow
 def test_stopped_tasks_save_what_they_have_and_those_that_wait_do_not_begin(finished: Path, tmp_path: Path) -> None:
-    endless = {"snapshot_every": 1, "mapping": {"optimise": {"steps": 5_000}}}
+    endless = {"snapshot_every": 4, "refine": {"steps": 10_000_000}}
     snapshot = tmp_path / "a" / "snapshot.npz"
     with LocalPool(tmp_path / "logs", jobs=1) as opened:
         for name in ("a", "b"):
@@ -149,7 +149,7 @@ def test_stopped_tasks_save_what_they_have_and_those_that_wait_do_not_begin(fini
 @pytest.mark.slow
 def test_a_task_saves_what_it_has_when_the_program_that_began_it_is_killed(finished: Path, tmp_path: Path) -> None:
     log = tmp_path / "batch" / "logs" / "a.log"
-    settings = ["snapshot_every=1", "mapping.optimise.steps=5000", f"output={tmp_path / 'a'}"]
+    settings = ["snapshot_every=4", "refine.steps=10000000", f"output={tmp_path / 'a'}"]
     call = [sys.executable, "-m", "modp_ti.commands.app", "batch", str(finished.parent / "scene.yaml")]
     call += [word for setting in settings for word in ("--set", setting)]
     program = subprocess.Popen([*call, "-o", str(tmp_path / "batch"), "--quiet"])
