@@ -10,28 +10,10 @@ from fields.runtime.engine import engine
 from modp_ti.engine.mapper import Mapper
 from modp_ti.files.errors import InputError
 from modp_ti.inputs.delivered_frames import DeliveredFrames
-from pipelines import settings
 from pipelines.pipeline import NothingToMapError, breakdown_percent
 from pipelines.settings import DensifySettings, MappingSettings, OfflineSettings, RefineSettings, StrictModel
 from pipelines.state import MapState
 from tests.pipelines.wall import frame
-
-SECTIONS = [
-    model for model in vars(settings).values() if isinstance(model, type) and issubclass(model, settings.StrictModel)
-]
-
-
-@pytest.mark.parametrize("section", SECTIONS, ids=lambda section: section.__name__)
-def test_every_key_says_what_it_means(section: type[BaseModel]) -> None:
-    assert issubclass(section, StrictModel)
-    for name, field in section.model_fields.items():
-        nested = isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel)
-        assert nested or field.description, name
-
-
-def test_an_unknown_key_is_an_error_that_names_it() -> None:
-    with pytest.raises(ValidationError, match=r"densify\.pixel"):
-        MappingSettings(densify={"pixel": 3})
 
 
 @pytest.mark.parametrize(

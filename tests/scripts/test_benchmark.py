@@ -179,21 +179,6 @@ def test_programs_run_interleaved_and_the_median_of_their_time_counts(monkeypatc
     assert [(p.seconds, p.psnr) for p in curves["room"]["a+"]] == [(20.0, 24.0)]
 
 
-def test_the_report_compares_the_programs_at_the_same_quality() -> None:
-    curves = {
-        "room": {
-            "new": [point(10.0, 20.0), point(40.0, 24.0), point(60.0, 25.0, "refined")],
-            "old": [point(40.0, 22.0), point(90.0, 26.0, "refined")],
-        }
-    }
-    text = quality.report(curves)
-    assert "| room, online, 1 steps | 22.00 | 40 | 20 | 50 |" in text
-    assert "| room, refined, 1 steps | 26.00 | 90 | – | – |" in text
-    # The refined map of `new` is best after a minute; that of `old` has not come yet.
-    assert "| room, new | 23.17 | 25.00 |" in text
-    assert "| room, old | – | 24.00 |" in text
-
-
 def test_another_commit_is_checked_out_and_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def git(*arguments: str) -> None:
         who = ["-c", "user.name=a", "-c", "user.email=a@example.com"]
@@ -214,10 +199,3 @@ def test_another_commit_is_checked_out_and_removed(tmp_path: Path, monkeypatch: 
     assert not other.exists()
     with pytest.raises(InputError, match="no such revision"), versions.checked_out("nowhere"):
         pass
-
-
-def test_the_table_of_a_given_time_has_the_last_map_of_each_run_and_how_late_it_was() -> None:
-    runs = {"room": {0.5: {"psnr": 20.0, "seconds": 29.0}, 3.0: {"psnr": 25.5, "seconds": 180.4}}}
-    text = quality.timed_report(runs | {"hall": {3.0: {"psnr": 22.25, "seconds": 170.0}}})
-    assert "| scene | 0.5 min | 3 min |" in text and "+0.4 s" in text
-    assert "| room | 20.00 | 25.50 |" in text and "| hall | – | 22.25 |" in text

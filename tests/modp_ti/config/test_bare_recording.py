@@ -10,7 +10,7 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from modp_ti.commands import app as cli
-from modp_ti.config.bare_recording import recorded_scene, streamed_scene
+from modp_ti.config.bare_recording import recorded_scene
 from modp_ti.config.presets import PRESETS
 from modp_ti.config.scene_file import dump_scene, load_scene
 from modp_ti.files.errors import InputError
@@ -250,8 +250,3 @@ def test_a_missing_video_is_named_by_the_real_session():
 
 def test_a_missing_camera_is_named_by_the_real_session():
     assert "camera 99: no such camera, or it is in use (source.stream)" in refusal("--stream", "99", "--quiet")
-
-
-def test_settings_of_a_stream_are_those_of_its_scene_file(folder):
-    (folder / "scene.yaml").write_text("source: {stream: 3}\ntracker: {kind: klt}\noutput: out/camera-3\n")
-    assert streamed_scene("3") == load_scene(folder / "scene.yaml")

@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 
 from modp_ti.engine.interruption import Interruption, RunStopped
-from modp_ti.files.processes import RecordingInterrupt
 
 
 def press() -> None:
@@ -57,30 +56,6 @@ def test_before_there_is_a_map_ctrl_c_interrupts_as_usual() -> None:
         with pytest.raises(KeyboardInterrupt):
             press()
         assert not stop.asked
-
-
-def test_a_recording_that_is_going_on_ends_first() -> None:
-    going_on, said = [True], []
-    with Interruption(lambda: said.append("stopping")) as stop:
-        recording = RecordingInterrupt(lambda: bool(going_on) and going_on.pop())
-        stop.begin()
-        press()
-        stop.check()
-        assert (going_on, said) == ([], [])
-        press()
-        assert stop.asked and said == ["stopping"]
-        with pytest.raises(KeyboardInterrupt):
-            press()
-        recording.give_back()
-
-
-def test_a_recording_that_has_ended_leaves_ctrl_c_to_the_run() -> None:
-    with Interruption(lambda: None) as stop:
-        recording = RecordingInterrupt(lambda: False)
-        stop.begin()
-        press()
-        assert stop.asked
-        recording.give_back()
 
 
 def test_afterwards_it_is_what_it_was() -> None:

@@ -17,12 +17,9 @@ from fields.runtime.backend import initialise
 from modp_ti.config.settings import ViewSettings
 from modp_ti.engine.live_viewer import PATIENCE, LiveViewer
 from modp_ti.engine.mapper import Mapper
-from modp_ti.outputs.progress import LiveStatus
 from modp_ti.outputs.viewer.handover import BrowserCamera
 from modp_ti.outputs.viewer.modes import LEAST_SIDE, MODES
-from pipelines.pipeline import FrameReport
 from pipelines.settings import MappingSettings
-from tests.pipelines.wall import frame
 
 if TYPE_CHECKING:
     from tests.room import RoomRecording
@@ -128,14 +125,6 @@ def test_a_paused_run_goes_on_where_the_browser_that_paused_it_has_gone(viewer: 
     assert viewer.said == []
 
 
-def test_a_realtime_run_shows_how_it_keeps_pace(viewer: LiveViewer):
-    viewer.on_frame(frame(0), FrameReport(0, True, 1, 100, 25.5, 4), LiveStatus(10.0, 9.5, 0.42, 3, 4.25))
-    numbers = viewer._overview().numbers
-    assert numbers is not None
-    assert "lag 0.4 s, 3 waiting, camera 10.0/s, tracked 9.5/s, 4.2 steps a keyframe" in numbers
-    assert "25.50 dB" in numbers
-
-
 def test_a_viewer_that_fails_says_so_once_and_lets_the_run_go_on(viewer: LiveViewer):
     visit(viewer)
     viewer._gate.pause(True)
@@ -143,18 +132,3 @@ def test_a_viewer_that_fails_says_so_once_and_lets_the_run_go_on(viewer: LiveVie
     for step in range(3):
         viewer.on_step("refining", step, 9, 30.0)
     assert viewer.said == ["the viewer has stopped, the run goes on: ZeroDivisionError: division by zero"]
-
-
-def test_a_page_that_fails_lets_a_paused_run_go_on(viewer: LiveViewer):
-    visit(viewer)
-    viewer.page.show_numbers = lambda text: 1 / 0
-    viewer._gate.pause(True)
-    viewer.on_step("refining", 1, 9, 30.0)  # the publishing thread opens the gate
-    assert viewer.said == ["the viewer has stopped, the run goes on: ZeroDivisionError: division by zero"]
-
-
-def test_without_a_browser_nothing_is_prepared(viewer: LiveViewer):
-    viewer._overview = viewer._show_map = lambda: pytest.fail("nobody looks")
-    for step in range(5):
-        viewer.on_step("refining", step, 9, 30.0)
-    assert viewer.said == []
