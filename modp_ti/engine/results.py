@@ -195,7 +195,8 @@ def metrics_of(
     trajectories = {"": list(versions.values())[-1].trajectory, "_tracked": frames.T_tracked}
     errors = {name: points.reprojection_error(camera, poses) for name, poses in trajectories.items()}
     for name, poses in trajectories.items():
-        errors["_anew" + name] = points.reprojection_error(camera, poses, points.placed_anew(camera, poses))
+        places = points.placed_anew(camera, poses, frames.held_out)
+        errors["_anew" + name] = points.reprojection_error(camera, poses, places)
     taken = {stage: seconds.get(stage, 0.0) for stage in STAGES}
     taken = {"total": seconds["total"], **taken, "other": seconds["total"] - sum(taken.values())}
     return {

@@ -161,7 +161,7 @@ class Snapshot:
         columns["camera"] = [PinholeCamera(*row) for row in columns["camera"]]
         columns["origin"] = np.array(columns["origin"])
         frames = DeliveredFrames(**columns, trajectory=trajectory)
-        frames.points.restore(MapState(self.arrays, {}).group("points"), frames.held_out)
+        frames.points.restore(MapState(self.arrays, {}).group("points"))
         return frames
 
     def online(self) -> MapVersion | None:

@@ -41,7 +41,6 @@ class TrackedPoints:
     def __init__(self) -> None:
         self.rows: list[NDArray[np.int32]] = []
         self.pixels: list[NDArray[np.float32]] = []
-        self._held_out: list[bool] = []
         self._row_of = RowsOfIds()
         self._xyz = np.zeros((0, 3))
         self._colours = np.zeros((0, 4), dtype=np.uint32)  # sums of red, green and blue, and the number of samples
@@ -68,17 +67,14 @@ class TrackedPoints:
             rgba = frame.rgba[row, column]
             seen = rgba[:, 3] > 0
             np.add.at(self._colours, rows[seen], np.c_[rgba[seen, :3], np.ones(seen.sum(), dtype=np.uint32)])
-        self._append(rows, points.pixels.astype(np.float32), frame.held_out)
-
-    def leave_out(self, frame: TrackedFrame) -> None:
-        """Record the next frame without its observations."""
-        self._append(*NOTHING, frame.held_out)
-
-    def _append(self, rows: NDArray[np.int32], pixels: NDArray[np.float32], held_out: bool) -> None:
         self.rows.append(rows)
-        self.pixels.append(pixels)
-        self._held_out.append(held_out)
+        self.pixels.append(points.pixels.astype(np.float32))
         self._observations += len(rows)
+
+    def leave_out(self) -> None:
+        """Record the next frame without its observations."""
+        self.rows.append(NOTHING[0])
+        self.pixels.append(NOTHING[1])
 
     def correct(
         self, ids: NDArray[np.int64], xyz: NDArray[np.float64], motions: Mapping[int, NDArray[np.float64]]
@@ -123,17 +119,10 @@ class TrackedPoints:
             "last": self._last[: len(self)],
         }
 
-    def restore(self, state: Mapping[str, NDArray], held_out: Sequence[bool]) -> None:
-        """Restore a state returned by `state`.
-
-        Args:
-            state: The arrays.
-            held_out: Whether each frame is held out.
-        """
-        cuts = np.cumsum(state["counts"])[:-1]
-        self.rows = np.split(state["rows"], cuts) if held_out else []
-        self.pixels = np.split(state["pixels"], cuts) if held_out else []
-        self._held_out = list(held_out)
+    def restore(self, state: Mapping[str, NDArray]) -> None:
+        """Restore a state returned by `state`."""
+        ends = np.cumsum(state["counts"])  # the last parts are empty
+        self.rows, self.pixels = (np.split(state[name], ends)[:-1] for name in ("rows", "pixels"))
         self._observations = len(state["rows"])
         self._row_of = RowsOfIds(state["ids"])
         self._xyz, self._colours, self._last = state["xyz"], state["colours"], state["last"]
@@ -188,7 +177,9 @@ class TrackedPoints:
             count += int(before.sum())
         return total / count if count else None
 
-    def placed_anew(self, cameras: list, poses: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+    def placed_anew(
+        self, cameras: list, poses: list[NDArray[np.float64]], held_out: Sequence[bool]
+    ) -> NDArray[np.float64]:
         """Triangulate the points again for given poses, using only frames that are not held out.
 
         A point keeps its position if fewer than two of these frames observe it, or if the new position does not reduce
@@ -197,6 +188,7 @@ class TrackedPoints:
         Args:
             cameras: Camera of each frame.
             poses: T_camera_world (4, 4) of each frame.
+            held_out: Whether each frame is held out.
 
         Returns:
             World positions (P, 3).
@@ -214,7 +206,7 @@ class TrackedPoints:
             np.concatenate(rays),
             np.repeat([1.0 / camera.fx for camera in cameras], counts),
         )
-        return placed_anew(np.stack(poses), seen, self.xyz, ~np.array(self._held_out))
+        return placed_anew(np.stack(poses), seen, self.xyz, ~np.array(held_out))
 
 
 @dataclass
@@ -273,7 +265,7 @@ class DeliveredFrames:
         if with_points:
             self.points.add(frame)
         else:
-            self.points.leave_out(frame)
+            self.points.leave_out()
 
     def correct(self, correction: PoseCorrection, around: Mapping[int, NDArray[np.float64]], moved: bool) -> None:
         """Apply a correction to the points and cameras. The map has applied it to the trajectory.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from modp_ti.inputs.sources import FrameReader, ImageSource, Intrinsics, require
 from modp_ti.inputs.sources.image_header import focal_length_35mm
 
 if TYPE_CHECKING:
+    from modp_ti.inputs.readers.klt import KltSettings
     from modp_ti.inputs.source_settings import SourceSettings
 
 CALIBRATION_FRAMES = 300
@@ -30,19 +31,9 @@ DIAGONAL_35MM = 43.27  # mm
 ENOUGH = 60
 
 
-class KltChoices(Protocol):
-    """What `KltSettings` says of loops and maps."""
-
-    loops: bool
-    maps: Any
-
-    @property
-    def place(self) -> int | None: ...
-
-
 def open_klt(
     source: SourceSettings,
-    settings: KltChoices | None = None,
+    settings: KltSettings | None = None,
     seed: int = 0,
     progress: Progress | None = None,
     images: ImageSource | None = None,

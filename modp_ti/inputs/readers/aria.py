@@ -39,37 +39,20 @@ BLOCK = 5_000
 
 
 @dataclass(frozen=True)
-class DeviceTrajectory:
-    """Device poses over time.
+class Transforms:
+    """Poses over time: of the device in the world, or of a camera on the device.
 
     Attributes:
-        times: Times (N,) on the device clock [s], strictly increasing.
-        T_world_device: Poses (N, 4, 4), device to world.
-        world: Name of the world frame (`graph_uid` or `session_uid`).
-        left_out: Number of poses that belong to other worlds and were dropped.
+        times: Times (N,) on the device clock [s], increasing.
+        matrices: Poses (N, 4, 4).
     """
 
     times: NDArray[np.float64]
-    T_world_device: NDArray[np.float64]
-    world: str
-    left_out: int
-
-
-@dataclass(frozen=True)
-class CameraMounts:
-    """Pose of a camera on the device, estimated over time.
-
-    Attributes:
-        times: Times (N,) [s].
-        T_device_camera: Poses (N, 4, 4), camera to device.
-    """
-
-    times: NDArray[np.float64]
-    T_device_camera: NDArray[np.float64]
+    matrices: NDArray[np.float64]
 
     def at(self, time: float) -> NDArray[np.float64]:
-        """Return the estimate (4, 4) nearest to `time` [s]."""
-        return self.T_device_camera[int(np.abs(self.times - time).argmin())]
+        """Return the pose (4, 4) nearest to `time` [s]."""
+        return self.matrices[int(np.abs(self.times - time).argmin())]
 
 
 class AriaSettings(TimedPosesSettings):
@@ -105,7 +88,7 @@ class AriaSettings(TimedPosesSettings):
         """
         images = recording.images
         folder, file = _trajectory_file(self.path, recording.source.require_path())
-        device = read_device_trajectory(file, open_loop=file.name == OPEN_LOOP)
+        device, world, left_out = read_device_trajectory(file, open_loop=file.name == OPEN_LOOP)
         calibration = folder / CALIBRATION
         mounts = read_calibration(calibration, self.camera) if calibration.is_file() else None
         missing = []
@@ -113,12 +96,12 @@ class AriaSettings(TimedPosesSettings):
             lost = f"{calibration} is missing: it would have brought where the camera {self.camera} sits on the device"
             if images.T_device_camera is None:
                 raise InputError(f"{lost} (T_device_camera), without which device poses are no camera poses")
-            mounts = CameraMounts(np.zeros(1), images.T_device_camera[None])
+            mounts = Transforms(np.zeros(1), images.T_device_camera[None])
             missing.append(f"{lost} (T_device_camera) over time; the recording's own is taken")
         rows = self.rows_at_frames(recording, file, device.times)
-        T_world_camera = np.stack([device.T_world_device[row] @ mounts.at(device.times[row]) for row in rows.values()])
+        T_world_camera = np.stack([device.matrices[row] @ mounts.at(device.times[row]) for row in rows.values()])
         recording.pose(dict(zip(rows, inverse_poses(T_world_camera), strict=True)))
-        recording.notes += [*_notes(device, None if missing else mounts, file), *missing]
+        recording.notes += [*_notes(device, left_out, None if missing else mounts, file), *missing]
 
         cloud = next((folder / name for name in POINTS if (folder / name).is_file()), None)
         if file.name == OPEN_LOOP or cloud is None:
@@ -129,7 +112,7 @@ class AriaSettings(TimedPosesSettings):
                 )
             recording.triangulate()
             return
-        numbers, xyz, total = read_points(cloud, device.world, self.max_inv_dist_std, self.max_dist_std)
+        numbers, xyz, total = read_points(cloud, world, self.max_inv_dist_std, self.max_dist_std)
         recording.notes.append(f"{len(numbers)} of {total} points of {cloud.name} are certain enough")
         _add_points(recording, folder, device.times[list(rows.values())], numbers, xyz, self.max_points)
 
@@ -162,15 +145,15 @@ def _trajectory_file(given: Path | None, images: Path) -> tuple[Path, Path]:
     )
 
 
-def _notes(device: DeviceTrajectory, mounts: CameraMounts | None, file: Path) -> list[str]:
+def _notes(device: Transforms, left_out: int, mounts: Transforms | None, file: Path) -> list[str]:
     notes = []
     if file.name == OPEN_LOOP:
         notes.append(
             f"{file.name} is odometry, which drifts; MPS's points are of another world and not used: features of the "
             "images are tracked and triangulated"
         )
-    if device.left_out:
-        notes.append(f"{device.left_out} poses of {file.name} are of another world than most (its graph): left out")
+    if left_out:
+        notes.append(f"{left_out} poses of {file.name} are of another world than most (its graph): left out")
     if mounts is not None:
         gap = max(device.times[0] - mounts.times[-1], mounts.times[0] - device.times[-1])
         if gap > 0:
@@ -253,15 +236,17 @@ def read_csv_blocks(path: Path, columns: Mapping[str, str]) -> Iterator[NDArray]
             line += len(rows)
 
 
-def read_device_trajectory(path: Path, open_loop: bool) -> DeviceTrajectory:
+def read_device_trajectory(path: Path, open_loop: bool) -> tuple[Transforms, str, int]:
     """Read closed_loop_trajectory.csv, or open_loop_trajectory.csv, the odometry, which drifts.
 
-    If there are several worlds (`graph_uid`; `session_uid` of the open loop), the one with most poses is used; poses of
-    the others are counted in `left_out`.
+    If there are several worlds (`graph_uid`; `session_uid` of the open loop), the one with most poses is used.
 
     Args:
         path: The file.
         open_loop: Whether it is that of the open loop.
+
+    Returns:
+        T_world_device, the name of the world, and the number of poses of other worlds.
 
     Raises:
         InputError: If the file is malformed. The message names file and line. The other readers do the same.
@@ -279,17 +264,17 @@ def read_device_trajectory(path: Path, open_loop: bool) -> DeviceTrajectory:
     table = table[rows]
     times = table["tracking_timestamp_us"] * MICROSECONDS
     poses = _poses(NumberRows(path, np.stack([times, *(table[name] for name in names)], axis=1), rows + 2))
-    return DeviceTrajectory(times, poses, str(main), int(count.sum() - count.max()))
+    return Transforms(times, poses), str(main), int(count.sum() - count.max())
 
 
-def read_calibration(path: Path, label: str) -> CameraMounts:
+def read_calibration(path: Path, label: str) -> Transforms:
     """Read `T_device_camera` of the camera with this label from online_calibration.jsonl."""
     numbered = enumerate(input_lines(path), start=1)
     table = np.array([(number, *_mount(line, label, path, number)) for number, line in numbered if line.strip()])
     if len(table) == 0:
         raise InputError(f"{path}: holds no calibration")
     rows = NumberRows(path, table[:, 1:], table[:, 0].astype(np.int64))
-    return CameraMounts(rows.values[:, 0], _poses(rows))
+    return Transforms(rows.values[:, 0], _poses(rows))
 
 
 def _poses(rows: NumberRows) -> NDArray[np.float64]:

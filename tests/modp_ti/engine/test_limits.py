@@ -58,11 +58,11 @@ def test_points_with_frames_left_out_come_back_from_their_state() -> None:
     points = TrackedPoints()
     for i in range(4):
         if i == 2:
-            points.leave_out(frame(i))
+            points.leave_out()
         else:
             points.add(frame(i))
     again = TrackedPoints()
-    again.restore(points.state(), [False] * 4)
+    again.restore(points.state())
     assert again.nbytes == points.nbytes == 3 * POINTS * (12 + 64)
     for name, array in points.state().items():
         np.testing.assert_array_equal(again.state()[name], array)

@@ -43,12 +43,6 @@ def half_mask() -> np.ndarray:
     return mask
 
 
-def test_without_masks_nothing_is_added(images: Path) -> None:
-    picture = reader(images).read("a.png", Undistorter(PINHOLE))
-    assert picture.mask is None
-    assert picture.vignette is None
-
-
 @pytest.mark.parametrize("name", ["a.png", "a.bmp", "a.jpg", "a.png.png"])
 def test_white_is_valid_and_black_is_not_in_any_image_format(images: Path, tmp_path: Path, name: str) -> None:
     write(tmp_path / "masks" / name, half_mask())

@@ -63,17 +63,6 @@ def test_the_folder_of_masks_may_lie_among_the_images(folder, tmp_path):
     assert list(ImageFolder(tmp_path, masks=tmp_path / "valid").names) == ["1.png"]
 
 
-def test_grey_sixteen_bit_and_transparent_images_become_rgb_bytes(folder, tmp_path):
-    made = folder("a.png")
-    cv2.imwrite(str(tmp_path / "a.png"), np.full((4, 5), 0x8000, np.uint16))
-    assert made.read("a.png").tolist() == np.full((4, 5, 3), 128).tolist()
-    cv2.imwrite(
-        str(tmp_path / "a.png"),
-        np.dstack([np.full((4, 5, 3), (1, 2, 3), np.uint8), np.zeros((4, 5), np.uint8)]),
-    )
-    assert made.read("a.png")[0, 0].tolist() == [3, 2, 1]
-
-
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".bmp", ".tif"])
 @pytest.mark.parametrize("part", [0.0, 0.1, 0.6, 0.98])
 def test_image_that_was_cut_off_is_named(folder, tmp_path, suffix, part, capfd):
