@@ -58,18 +58,6 @@ def test_image_is_that_of_the_pinhole_camera(model, scale):
     assert np.percentile(error, 99.9) < 0.012
 
 
-@pytest.mark.parametrize("scale", [1.0, 0.37])
-@pytest.mark.parametrize("model", CAMERAS)
-def test_points_land_where_the_pinhole_camera_sees_them(model, scale):
-    undistorter, oracle = made(model, scale)
-    rng = np.random.default_rng(5)
-    in_camera = np.c_[rng.uniform(-0.5, 0.5, 200), rng.uniform(-0.35, 0.35, 200), np.ones(200)] * rng.uniform(
-        1, 9, (200, 1)
-    )
-    raw = oracle.img_from_cam(in_camera)
-    np.testing.assert_allclose(undistorter.points(raw), undistorter.camera.project(in_camera), atol=1e-5)
-
-
 @pytest.mark.parametrize("model", ["SIMPLE_RADIAL", "OPENCV", "OPENCV_FISHEYE"])
 def test_mask_holds_exactly_the_pixels_that_the_photograph_covers(model):
     undistorter, oracle = made(model, 0.5)

@@ -179,20 +179,11 @@ def test_stream_without_times_is_timed_by_the_setting(tmp_path):
     assert len(made.notes) == 1
 
 
-@pytest.mark.parametrize(
-    ("asked", "found"),
-    [
-        ("room_000003", "room_000003"),
-        ("frames/room_000003.png", "room_000003"),
-        ("frames\\room_000003.JPG", "room_000003"),
-        ("room_000040", None),
-        ("000003.png", None),
-        ("room.mp4", None),
-        ("", None),
-    ],
-)
-def test_a_frame_is_found_by_its_whole_name_alone(mp4, asked, found):
-    assert VideoFile(mp4).find(asked) == found
+def test_a_frame_is_found_by_its_whole_name_alone(mp4):
+    made = VideoFile(mp4)
+    for asked in ("room_000003", "frames/room_000003.png", "frames\\room_000003.JPG"):
+        assert made.find(asked) == "room_000003"
+    assert not any(map(made.find, ("room_000040", "000003.png", "room.mp4", "")))
 
 
 @pytest.mark.parametrize("part", [0.5, 0.9])

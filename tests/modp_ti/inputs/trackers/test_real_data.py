@@ -50,16 +50,6 @@ def test_colmap_points_project_onto_their_pixels(shared_data, name, frames, size
     assert first.image.std() > 0.1
 
 
-def test_frames_of_redkitchen_without_pose_are_counted_and_keep_their_times(shared_data):
-    tracker = opened_with(
-        SourceSettings(path=shared_data("redkitchen") / "images", start=0, stop=50, scale=1.0),
-        ColmapSettings(),
-    )
-    assert tracker.notes[0].startswith("40 of 50 images have no pose")
-    times = [frame.timestamp for frame in tracker]
-    np.testing.assert_allclose(times, np.arange(0, 50, 5) / 30)
-
-
 @pytest.fixture(scope="module")
 def fox_transforms() -> ReplayedTracker:
     data = Path(__file__).resolve().parents[5] / "shared" / "data" / "fox"
@@ -67,12 +57,6 @@ def fox_transforms() -> ReplayedTracker:
         pytest.skip("no ../shared/data/fox")
     source = SourceSettings(path=data / "images", scale=0.25, holdout=8)
     return opened_with(source, TransformsSettings())
-
-
-def test_fox_lists_seventeen_frames_without_image(fox_transforms):
-    assert len(fox_transforms.notes) == 1
-    assert fox_transforms.notes[0].startswith("17 frames of transforms.json are not in ")
-    assert len(fox_transforms) == 50
 
 
 def test_fox_is_triangulated_densely_and_exactly(fox_transforms):

@@ -109,19 +109,6 @@ def test_stella_s_trajectory_is_as_near_to_the_other_one_as_is_known_of_it(share
     assert np.sqrt((error**2).sum(axis=1).mean()) == pytest.approx(0.048, abs=0.0005)
 
 
-def test_stella_s_landmarks_are_seen_where_they_were_observed(stella):
-    errors, counts = [], []
-    for frame in stella.frames:
-        p = frame.points.xyz @ frame.T_camera_world[:3, :3].T + frame.T_camera_world[:3, 3]
-        off = np.linalg.norm(frame.undistorter.camera.project(p) - frame.points.pixels, axis=1)
-        errors.append(2 * np.median(off))  # in pixels of the stored image
-        counts.append(len(off))
-    keyframes = np.array(errors) > 1e-6
-    assert keyframes.sum() == 54
-    assert np.median(np.array(errors)[keyframes]) < 1.2 and max(errors) < 2.0
-    assert min(counts) >= 100
-
-
 def test_aria_s_files_are_read_and_the_missing_one_is_named(shared_data, tmp_path):
     folder = shared_data("aria") / "mps_sample" / "trajectory"
     rows = (folder / "closed_loop_trajectory.csv").read_text().splitlines()
