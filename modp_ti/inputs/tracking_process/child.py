@@ -21,7 +21,7 @@ from modp_ti.files.terminal import own_terminal
 from modp_ti.inputs.klt import KltTracker, open_klt
 from modp_ti.inputs.opening import open_source
 from modp_ti.inputs.sources import FrameReader, ImageSource, Picture, Undistorter
-from modp_ti.inputs.tracking_process.exchange import (
+from modp_ti.inputs.tracking_process.parent import (
     CameraRevised,
     CountsBoard,
     Ended,

@@ -9,7 +9,8 @@ from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import SparsePoints, TrackedFrame
 from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import exp_se3, inverse_se3
-from modp_ti.inputs.delivered_frames import DeliveredFrames
+from modp_ti.inputs import delivered_frames
+from modp_ti.inputs.delivered_frames import DeliveredFrames, RowsOfIds
 
 CAMERA = PinholeCamera(40.0, 40.0, 16.0, 12.0, 32, 24)
 DEPTHS = np.array([1.0, 2.0, 3.0])
@@ -64,3 +65,23 @@ def test_points_that_the_tracker_names_are_where_it_says(frames: DeliveredFrames
     np.testing.assert_array_equal(frames.points.ids[changed], [21])
     np.testing.assert_array_equal(frames.points.xyz[changed], [[7.0, 8.0, 9.0]])
     assert frames.corrections == {"received": 1, "moved": 0}
+
+
+def test_rows_are_those_of_a_dictionary(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(delivered_frames, "RECENT", 20)
+    rng, rows, expected = np.random.default_rng(1), RowsOfIds(), {}
+    for frame in range(60):
+        ids = rng.integers(-50, 50 + 20 * frame, 40)  # some known, some new, some twice
+        np.testing.assert_array_equal(rows.find(ids), [expected.get(i, -1) for i in ids.tolist()])
+        np.testing.assert_array_equal(rows.take(ids), [expected.setdefault(i, len(expected)) for i in ids.tolist()])
+        assert len(rows) == len(expected)
+        np.testing.assert_array_equal(rows.ids, list(expected))
+    again = RowsOfIds(rows.ids)
+    ids = np.array([*expected, 10**12, -(2**62)])
+    np.testing.assert_array_equal(again.find(ids), [*expected.values(), -1, -1])
+
+
+def test_no_ids_have_no_rows() -> None:
+    rows, none = RowsOfIds(), np.zeros(0, dtype=np.int64)
+    assert len(rows.find(none)) == len(rows.take(none)) == len(rows) == len(rows.ids) == 0
+    np.testing.assert_array_equal(rows.find(np.array([3])), [-1])
