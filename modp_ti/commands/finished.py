@@ -60,8 +60,8 @@ EXAMPLES = {
 PATH_NAMES = ("recorded", "smoothed", "orbit")
 # fmt: off
 Format = Literal[
-    "points", "mesh", "splat", "spz", "sog", "sog-lod", "compressed-ply", "splat-glb", "usd", "html", "colmap",
-    "nerfstudio", "video",
+    "points", "mesh", "collision", "splat", "spz", "sog", "sog-lod", "compressed-ply", "splat-glb", "usd", "html",
+    "colmap", "nerfstudio", "video",
 ]
 # fmt: on
 NOT_FOUND = 1
@@ -146,7 +146,8 @@ def export(
             "--format",
             "-f",
             help="`html`: a page that shows the map in any browser, without network; `points`: coloured points (PLY); "
-            "`mesh`: surface with colours (PLY, GLB, OBJ); `splat`, `spz`, `sog`, `compressed-ply`, `splat-glb`: "
+            "`mesh`: surface with colours (PLY, GLB, OBJ); `collision`: what is free and what solid (voxels, ROS, "
+            "OctoMap, light mesh); `splat`, `spz`, `sog`, `compressed-ply`, `splat-glb`: "
             "splats for viewers; `usd`: splats in OpenUSD (needs the extra `usd`); `sog-lod`: a folder to serve, of "
             "which a browser loads what it shows; `colmap`, `nerfstudio`: images with poses and points, to train on; "
             "`video`: the path",
@@ -157,7 +158,10 @@ def export(
         typer.Option("--output", "-o", metavar="PATH", help="file or new folder; empty: in OUT"),
     ] = None,
     voxel: Annotated[
-        float | None, typer.Option(min=0, help="`mesh`: edge of its voxels in scene units; empty: scene depth / 160")
+        float | None,
+        typer.Option(
+            min=0, help="`mesh`, `collision`: edge of the voxels in scene units; empty: scene depth / 160, / 50"
+        ),
     ] = None,
     texture: Annotated[
         bool, typer.Option("--texture", help="`mesh`: with a texture, as GLB (needs the extra `texture`)")
@@ -165,15 +169,19 @@ def export(
     spz_version: Annotated[
         int | None, typer.Option(min=2, max=4, help="`spz`: version of the format, 2 to 4; empty: 3")
     ] = None,
+    height: Annotated[
+        float | None,
+        typer.Option(min=0, help="`collision`: height of ROS's map above the floor; empty: that of the cameras"),
+    ] = None,
     device: OnDevice = "auto",
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> None:
-    """Write a finished map as web page, points, mesh, compressed splats, data set or video."""
+    """Write a finished map as web page, points, mesh, collision shapes, compressed splats, data set or video."""
     with outcome(as_json) as result:
         from modp_ti.outputs.playback.export_map import ExportOptions, export_map
 
-        options = ExportOptions(voxel, texture, device, spz_version)
+        options = ExportOptions(voxel, texture, device, spz_version, height)
         options.require_used(format)
         run, line = _opened(out, quiet)
         target = export_map(run, format, output, options, line)

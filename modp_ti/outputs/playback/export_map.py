@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 
 from fields.frames.origin import shifted_poses
 from fields.geometry.camera import PinholeCamera
+from fields.geometry.se3 import camera_centres
 from modp_ti.files.errors import InputError
 from modp_ti.files.run_folder import list_files, refuse_foreign
+from modp_ti.outputs.formats.collision import boundary, write_octomap, write_ros_map, write_voxels
 from modp_ti.outputs.formats.compressed_splats import SPZ_VERSION, write_compressed_ply, write_spz, write_web_splat
 from modp_ti.outputs.formats.dataset import image_names, new_folder, rename_images, write_image, write_transforms
 from modp_ti.outputs.formats.gltf import write_splat_glb
@@ -41,11 +43,15 @@ from modp_ti.outputs.progress import ProgressLine
 from modp_ti.outputs.report.page import show_link_to_map
 from modp_ti.outputs.splat_page.page import level, moved, viewer_settings, write_splat_page
 from pipelines.surface.depth import DepthMatcher, DepthView, joined_depth
+from pipelines.surface.free_space import carved, reached
 from pipelines.whole.hierarchy import Hierarchy
 
 TEXTURED_NAME, PAGE = "mesh.glb", "map.html"
 # Edge of the mesh's voxels, and largest depth that is fused, both relative to the scene's depth.
 VOXEL, FARTHEST = 1 / 160, 4.0
+# Edge of the voxels of free space, and the longest straight way between two frames that a camera is taken to have gone,
+# both relative to the scene's depth.
+SPACE_VOXEL, JUMP = 1 / 50, 0.5
 # Most views that are fused, evenly spaced over the frames, and their longer side [px]. A pixel is then finer than the
 # mesh's voxels. The same of the pictures that a texture is painted from.
 SURFACE_VIEWS, LONGEST_SIDE = 300, 480
@@ -57,27 +63,30 @@ class ExportOptions:
     """Options of an export.
 
     Attributes:
-        voxel: Edge of the mesh's voxels [scene units], None for VOXEL times the scene's depth.
+        voxel: Edge of the voxels of a mesh or of free space [scene units], None for the default.
         texture: Whether the mesh gets a texture instead of a colour per vertex.
         device: Device for rendering.
         spz_version: Version of `.spz` to write, None for the default.
+        height: Height above the floor of the slice of free space [scene units], None for that of the cameras.
     """
 
     voxel: float | None = None
     texture: bool = False
     device: str = "auto"
     spz_version: int | None = None
+    height: float | None = None
 
     def require_used(self, format: str) -> None:
         """Raise InputError if an option is given that the format ignores."""
         given = {
-            "voxel": ("mesh", self.voxel),
-            "texture": ("mesh", self.texture),
-            "spz-version": ("spz", self.spz_version),
+            "voxel": (("mesh", "collision"), self.voxel),
+            "texture": (("mesh",), self.texture),
+            "spz-version": (("spz",), self.spz_version),
+            "height": (("collision",), self.height),
         }
         for option, (of, value) in given.items():
-            if value and format != of:
-                raise InputError(f"--{option}: --format {format} has none; use --format {of}, or leave it out")
+            if value and format not in of:
+                raise InputError(f"--{option}: --format {format} has none; use --format {of[0]}, or leave it out")
 
 
 @dataclass(frozen=True)
@@ -216,12 +225,7 @@ def _video(run: FinishedRun, target: Path, options: ExportOptions, line: Progres
 def _mesh(run: FinishedRun, target: Path, options: ExportOptions, line: ProgressLine) -> None:
     voxel = options.voxel or VOXEL * run.record.scene_depth
     longest = LONGEST_PAINTED_SIDE if options.texture else LONGEST_SIDE
-    largest = [_within(run.cameras[index], longest) for index in run.mapped]
-    with line.working("loading the map"):
-        gaussians = run.gaussians
-        start_device(options.device)
-    width, height = max(camera.width for camera in largest), max(camera.height for camera in largest)
-    renderer = MapRenderer(gaussians, width, height, run.record.near)
+    renderer = _loaded(run, longest, options.device, line)
     views = _surface_views(run, renderer, line)
     with line.working("fusing depth"):
         grid = fused(views, voxel, FARTHEST * run.record.scene_depth)
@@ -237,6 +241,46 @@ def _mesh(run: FinishedRun, target: Path, options: ExportOptions, line: Progress
     if target.suffix.lower() == ".ply" and run.record.origin.any():  # its coordinates are double
         mesh.translate(run.record.origin)
     write_mesh(target, mesh)
+
+
+def _collision(run: FinishedRun, target: Path, options: ExportOptions, line: ProgressLine) -> None:
+    """Write what is free and what is solid, in axes whose z points up."""
+    depth = run.record.scene_depth
+    with new_folder(target) as folder:
+        views = _surface_views(run, _loaded(run, LONGEST_SIDE, options.device, line), line)
+        R = level(run.poses, depth).R
+        R_grid_world = np.stack([R[0], R[2], -R[1]])
+        places = camera_centres(run.poses)
+        way = places[run.way]
+        jumps = np.flatnonzero(np.linalg.norm(np.diff(way, axis=0), axis=1) > JUMP * depth) + 1
+        with line.working("carving space"):
+            seen = [(view.camera, view.T_camera_world, view.depth) for view in views]
+            try:
+                voxel = options.voxel or SPACE_VOXEL * depth
+                space = carved(seen, np.split(way, jumps), R_grid_world, voxel, FARTHEST * depth)
+            except ValueError as error:
+                raise InputError(f"{error}; use larger ones (--voxel)") from None
+        height = float(np.median(places @ R_grid_world[2]))
+        floor = space.floor(height)
+        if options.height is not None:
+            if floor is None:
+                raise InputError("--height: no floor was seen below the cameras; leave it out for the cameras' height")
+            height = floor + options.height
+        with line.working("extracting the surface"):
+            write_voxels(folder / "voxels.npz", space, run.record.origin, floor)
+            write_ros_map(folder, space, height)
+            write_octomap(folder / "voxels.bt", space)
+            write_mesh(folder / "mesh.glb", boundary(space, reached(space, places)))
+
+
+def _loaded(run: FinishedRun, longest: int, device: str, line: ProgressLine) -> MapRenderer:
+    """Load the map for pictures of its frames with at most `longest` pixels on a side."""
+    cameras = [_within(run.cameras[index], longest) for index in run.mapped]
+    with line.working("loading the map"):
+        gaussians = run.gaussians
+        start_device(device)
+    width, height = max(camera.width for camera in cameras), max(camera.height for camera in cameras)
+    return MapRenderer(gaussians, width, height, run.record.near)
 
 
 def _surface_views(run: FinishedRun, renderer: MapRenderer, line: ProgressLine) -> list[SurfaceView]:
@@ -287,6 +331,7 @@ def _within(camera: PinholeCamera, longest: int) -> PinholeCamera:
 FORMATS = {
     "points": Format("points.ply", _points, (".ply",)),
     "mesh": Format("mesh.ply", _mesh, MESH_SUFFIXES),
+    "collision": Format("collision", _collision),
     "splat": Format("splats.splat", _plain_splats, (".splat",)),
     "spz": Format("splats.spz", _spz, (".spz",)),
     "sog": Format("splats.sog", _splats(write_sog), (".sog",)),

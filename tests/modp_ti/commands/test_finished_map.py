@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from plyfile import PlyData
 from typer.testing import CliRunner, Result
 
+from fields.geometry.se3 import camera_centres
 from modp_ti.commands.app import app
 from modp_ti.inputs.readers.transforms import TransformsSettings
 from modp_ti.inputs.source_settings import SourceSettings
@@ -249,6 +250,17 @@ def test_a_nerfstudio_data_set_is_read_by_our_own_reader_and_has_its_split(out: 
         assert frame.camera == camera
 
 
+def test_collision_shapes_bound_what_the_cameras_saw(out: Path, tmp_path: Path) -> None:
+    folder = done("export", out, "--format", "collision", "--voxel", 0.1, "-o", tmp_path / "shapes")
+    assert sorted(p.name for p in folder.iterdir()) == ["map.pgm", "map.yaml", "mesh.glb", "voxels.bt", "voxels.npz"]
+    with np.load(folder / "voxels.npz") as file:
+        at = camera_centres(open_run(out).poses) @ file["T_grid_world"][:3, :3].T + file["T_grid_world"][:3, 3]
+        index = np.floor((at - file["origin"]) / file["voxel"]).astype(int)
+        assert file["voxel"] == 0.1 and (file["state"][tuple(index.T)] == 1).all()
+        assert (file["state"] == 2).sum() > 50 < (file["state"] == 0).sum()
+        np.testing.assert_allclose(file["T_grid_world"][2, :3], [0.0, 0.0, 1.0], atol=0.2)  # z is up in the test room
+
+
 def failure(*arguments: str | Path) -> str:
     result = invoke(*arguments)
     assert result.exit_code == 2
@@ -264,6 +276,7 @@ def failure(*arguments: str | Path) -> str:
         ("export --format points --texture", "--texture"),
         ("export --format spz --voxel 0.1", "--voxel"),
         ("export --format html --spz-version 3", "--spz-version"),
+        ("export --format mesh --height 1", "--height"),
         ("export --format spz -o {out}/splats.ply/here.spz", "splats.ply"),
         ("export --format points -o {out}/splats.ply", "splats.ply"),
         ("export --format video -o film.avi", ".mp4"),
