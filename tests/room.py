@@ -95,6 +95,10 @@ class Room:
             hit["primitive_normals"].numpy().astype(np.float64),
         )
 
+    def distance(self, xyz: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Return the distance (N,) of points (N, 3) from the nearest surface."""
+        return self._scene.compute_distance(self._tensor(xyz.astype(np.float32)), nthreads=1).numpy()
+
     def depth(
         self, camera: PinholeCamera, T_camera_world: NDArray[np.float64], pixels: NDArray[np.float64]
     ) -> NDArray[np.float64]:

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from fields.runtime.engine import EngineError, engine
-from modp_ti.commands import batch, finished, input, run
+from modp_ti.commands import batch, edit, finished, input, run
 from modp_ti.commands.shared import BAD_INPUT, MARKUP, CommandGroup, examples
 from modp_ti.version import __version__
 
@@ -17,6 +17,7 @@ OVERVIEW = examples(
     "modp-ti run room.mp4   (the same without a scene file)",
     "modp-ti batch */scene.yaml   (many recordings)",
     "modp-ti refine OUT   (a finished map, by several processes)",
+    "modp-ti clean OUT   (without floaters, in OUT-clean)",
     "modp-ti render OUT --path orbit   (OUT: the output folder of a run)",
     "modp-ti export OUT --format html",
     "modp-ti locate OUT new.jpg",
@@ -58,9 +59,9 @@ def _options(
         raise typer.Exit(BAD_INPUT)
 
 
-EXAMPLES = {"run": run.EXAMPLES, "batch": batch.EXAMPLES, **finished.EXAMPLES, **input.EXAMPLES}
+EXAMPLES = {"run": run.EXAMPLES, "batch": batch.EXAMPLES, **finished.EXAMPLES, **edit.EXAMPLES, **input.EXAMPLES}
 for command in (
-    *(run.run, batch.batch, finished.refine, input.cameras, input.check),
+    *(run.run, batch.batch, finished.refine, edit.clean, edit.crop, input.cameras, input.check),
     *(finished.render, finished.export, finished.measure, finished.locate, finished.view, input.warmup),
 ):
     app.command(epilog=EXAMPLES[command.__name__])(command)

@@ -61,7 +61,7 @@ def refine_run(folder: Path, steps: int | None = None, console: Console | None =
     """
     folder = folder.expanduser().resolve()
     run = open_run(folder)
-    config = _settings_of(run, steps)
+    config = refinable(run, steps)
     with sole_use(folder):
         require_usable(folder)
         metrics = read_json(folder / "metrics.json", "of a finished run")
@@ -72,8 +72,8 @@ def refine_run(folder: Path, steps: int | None = None, console: Console | None =
             raise KeyboardInterrupt(f"interrupted: {folder} is as it was") from None
 
 
-def _settings_of(run: FinishedRun, steps: int | None) -> SceneConfig:
-    """Return the settings of the run, with those of this refinement. Raises InputError if it cannot be refined."""
+def refinable(run: FinishedRun, steps: int | None = None) -> SceneConfig:
+    """Return the settings of a run, with those of this refinement. Raises InputError if it cannot go on."""
     config, folder = run_settings(run), run.folder
     if (folder / FILE).is_file() or not (folder / "metrics.json").is_file():
         raise InputError(f"{folder}: its run has not finished: modp-ti run --resume {folder} goes on with it")
@@ -96,7 +96,7 @@ def _refined(run: FinishedRun, config: SceneConfig, metrics: dict[str, Any], lin
         backend = initialise(config.device, config.mapper_threads, config.seed)
     except RuntimeError as error:
         raise InputError(str(error)) from None
-    mapper = _mapper_of(run, config, line)
+    mapper = mapper_of(run, config, line)
     began, before = time.perf_counter(), mapper.renderer.view_renders
     line.start("refining", config.refine.steps)
     try:
@@ -139,14 +139,14 @@ def _refined(run: FinishedRun, config: SceneConfig, metrics: dict[str, Any], lin
     return metrics
 
 
-def _mapper_of(run: FinishedRun, config: SceneConfig, line: ProgressLine) -> OnlineMapper:
-    """Return a mapper with the map of the run."""
+def mapper_of(run: FinishedRun, config: SceneConfig, line: ProgressLine) -> OnlineMapper:
+    """Return a mapper with the map of the run. Raises InputError if its map or its frames do not fit the settings."""
     mapper = build_mapper(config, run.cameras[0].resized(*run.size)).online
     frames = line.through("reading the frames", frames_of(run, run.mapped, line.prepare), len(run.mapped))
     try:
         go_on(mapper, finished_map(run, frames))
     except ValueError as error:
-        raise InputError(f"{run.folder}: its map cannot be refined: {error}") from None
+        raise InputError(f"{run.folder}: its map does not fit its settings: {error}") from None
     return mapper
 
 

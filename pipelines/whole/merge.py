@@ -68,39 +68,47 @@ class FreeSpace:
         """Return which of the loaded Gaussians (N,), of maps of these numbers, float before surfaces of other maps."""
         before, elsewhere = np.zeros(len(numbers)), np.zeros(len(numbers))
         for view in views:
-            index, weight, weighted_ratio = self._shown(view)
-            is_before = (weighted_ratio < BEFORE * weight) & (numbers[index] != view.number)
+            has_surface = view.depth > 0
+            inverse = np.where(has_surface, 1.0 / np.where(has_surface, view.depth, 1.0), 0.0)
+            index, z, (weight, weighted_inverse) = self.shown(view.camera, view.T_camera_world, has_surface, inverse)
+            is_before = (z * weighted_inverse < BEFORE * weight) & (numbers[index] != view.number)
             before[index] += np.where(is_before, weight, 0.0)
             elsewhere[index] += np.where(is_before, 0.0, weight)
         return before > elsewhere
 
-    def _shown(self, view: ShownSurface) -> tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.float32]]:
-        """Return the indices (M,) of the Gaussians in a view, and the sums (M,) of alpha T and of alpha T z / D."""
-        renderer, has_surface = self.renderer, view.depth > 0
-        renderer.forward(view.camera, view.T_camera_world, self._near)
-        inverse = np.where(has_surface, 1.0 / np.where(has_surface, view.depth, 1.0), 0.0)
-        none = np.zeros_like(inverse)
-        renderer.images.set_gradients(np.stack([has_surface, inverse, none], axis=-1), none, none)
+    def shown(
+        self, camera: PinholeCamera, T_camera_world: NDArray[np.float64], *channels: NDArray
+    ) -> tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.float32]]:
+        """Render the loaded Gaussians, and sum values of pixels by how much each Gaussian shows in them.
+
+        Args:
+            camera: The camera.
+            T_camera_world: (4, 4) pose.
+            *channels: One to three images (H, W) of values.
+
+        Returns:
+            Indices (M,) of the Gaussians in the image, their depths z (M,), and the sums (C, M) of alpha T times value.
+        """
+        renderer = self.renderer
+        renderer.forward(camera, T_camera_world, self._near)
+        none = np.zeros_like(channels[0], dtype=np.float32)
+        colour = np.stack([*channels, *[none] * (3 - len(channels))], axis=-1)
+        renderer.images.set_gradients(colour, none, none)
         renderer.compositing.backward()
         renderer.view_renders += 1
         count = self.projected.seen[None]
-        index = np.empty(count, dtype=np.int32)
-        weight, weighted_ratio = np.empty(count, dtype=np.float32), np.empty(count, dtype=np.float32)
+        index, values = np.empty(count, dtype=np.int32), np.empty((count, 4), dtype=np.float32)
         if count:
-            self._read(index, weight, weighted_ratio)
-        return index, weight, weighted_ratio
+            self._read(index, values)
+        return index, values[:, 3], values.T[: len(channels)]
 
     @ti.kernel
-    def _read(
-        self,
-        index: ti.types.ndarray(dtype=ti.i32, ndim=1),
-        weight: ti.types.ndarray(dtype=ti.f32, ndim=1),
-        weighted_ratio: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    ):
+    def _read(self, index: ti.types.ndarray(dtype=ti.i32, ndim=1), values: ti.types.ndarray(dtype=ti.f32, ndim=2)):
         for s in range(index.shape[0]):
             index[s] = self.projected.gaussian[s]
-            weight[s] = ti.cast(self.projected.colour.grad[s][0], ti.f32)
-            weighted_ratio[s] = ti.cast(self.projected.depth[s] * self.projected.colour.grad[s][1], ti.f32)
+            for c in ti.static(range(3)):
+                values[s, c] = ti.cast(self.projected.colour.grad[s][c], ti.f32)
+            values[s, 3] = ti.cast(self.projected.depth[s], ti.f32)
 
 
 Exposures = Mapping[int, NDArray[np.float64]]

@@ -1,0 +1,148 @@
+"""`modp-ti clean` and `modp-ti crop` on the output folder of a small run of the room, with splats planted in it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from typer.testing import CliRunner
+
+from fields.geometry.se3 import camera_centres
+from modp_ti.commands.app import app
+from modp_ti.engine.edited_run import Region
+from modp_ti.outputs.formats.splats_ply import write_splats
+from modp_ti.outputs.playback.finished_run import open_run
+from pipelines.whole.cleaning import harmless
+from tests.room import Room
+
+pytestmark = pytest.mark.slow
+PLANTED = 6
+
+
+def command(*arguments: object) -> dict:
+    result = CliRunner().invoke(app, [*map(str, arguments), "--quiet", "--json"])
+    data = json.loads(result.stdout)
+    return data | {"code": result.exit_code}
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+@pytest.fixture(scope="module")
+def planted(finished: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run with splats of the map, in colours of chance, halfway between the cameras and the room's surfaces."""
+    out = shutil.copytree(finished, tmp_path_factory.mktemp("planted") / "out")
+    run, rng, room, places = open_run(out), np.random.default_rng(5), Room(), []
+    for k in run.mapped:
+        camera, T = run.cameras[k], run.poses[k]
+        pixels = rng.uniform([0.25 * camera.width, 0.25 * camera.height], [0.75 * camera.width, 0.75 * camera.height])
+        z = 0.5 * room.depth(camera, T, pixels[None])
+        places.append((camera.unproject(pixels[None], z) - T[:3, 3]) @ T[:3, :3])
+    state = run.gaussians
+    pick = rng.choice(np.flatnonzero(state["opacity_logit"] > 0), PLANTED)
+    new = {name: values[pick] for name, values in state.items()}
+    centre = np.resize(np.concatenate(places), (PLANTED, 3))
+    new["position"] = (centre + rng.normal(0, 0.05, centre.shape)).astype(np.float32)
+    new["sh"] = rng.normal(0, 1.2, new["sh"].shape).astype(np.float32)
+    new["sh"][:, 1:] = 0
+    write_splats(out / "splats.ply", {name: np.concatenate([state[name], new[name]]) for name in state})
+    return out
+
+
+def kept(before: Path, after: Path) -> NDArray[np.bool_]:
+    """Which Gaussians of a map are those of another one, in every bit of all values."""
+
+    def rows(folder: Path) -> list[bytes]:
+        state = open_run(folder).gaussians
+        return [
+            b"".join(values) for values in zip(*([row.tobytes() for row in v] for v in state.values()), strict=True)
+        ]
+
+    there = set(rows(after))
+    return np.array([row in there for row in rows(before)])
+
+
+def test_planted_splats_are_removed_and_those_of_surfaces_stay(planted: Path, tmp_path: Path) -> None:
+    before = files(planted)
+    found = command("clean", planted, "-o", tmp_path / "clean")
+    assert found["code"] == 0
+    stays = kept(planted, tmp_path / "clean")
+    assert (~stays[-PLANTED:]).mean() >= 0.9
+    room = Room()
+    xyz = open_run(planted).gaussians["position"][:-PLANTED]
+    on_surface = room.distance(xyz) < 0.05
+    assert (~stays[:-PLANTED])[on_surface].mean() <= 0.005
+    assert found["after"] > found["before"]
+    assert found["kept"] + sum(found["removed"].values()) == len(stays) and found["kept"] == stays.sum()
+    assert files(planted) == before
+
+
+def test_every_command_takes_the_new_folder(planted: Path, tmp_path: Path) -> None:
+    part = tmp_path / "part"
+    cut = command("crop", planted, "--around-cameras", 2.5, "-o", part)
+    run = open_run(planted)
+    poses, xyz = run.poses, run.gaussians["position"].astype(float)
+    near = np.min([np.linalg.norm(xyz - c, axis=1) for c in camera_centres(poses)], axis=0) <= 2.5
+    np.testing.assert_array_equal(kept(planted, part), near)
+    assert (cut["kept"], cut["removed"]) == (near.sum(), (~near).sum())
+    np.testing.assert_array_equal(open_run(part).poses, poses)
+    assert command("export", part, "--format", "points", "-o", tmp_path / "points.ply")["code"] == 0
+    assert command("render", part, "--frames", 2, "--path", "orbit", "-o", tmp_path / "orbit")["code"] == 0
+    assert command("refine", part, "--steps", 1)["metrics"]["gaussians"] <= cut["kept"]
+
+
+@pytest.mark.parametrize(
+    "wrong", [(), ("--box", "1,2,3"), ("--sphere", "0,0,0,x"), ("--sphere", "99,99,99,0.1"), ("--above", "9999")]
+)
+def test_a_region_without_meaning_or_content_writes_nothing(planted: Path, tmp_path: Path, wrong: tuple) -> None:
+    found = command("crop", planted, *wrong, "-o", tmp_path / "none")
+    assert found["code"] == 2 and found["error"]
+    assert not (tmp_path / "none").exists()
+
+
+def test_the_map_of_a_run_is_never_replaced_but_that_of_an_earlier_crop_is(planted: Path, tmp_path: Path) -> None:
+    other = shutil.copytree(planted, tmp_path / "other")
+    before = files(planted)
+    for output in (planted, other):
+        assert command("crop", planted, "--above", -9, "-o", output)["code"] == 2
+        assert files(output) == before
+    for reach in (9, 2.5):
+        found = command("crop", planted, "--around-cameras", reach, "-o", tmp_path / "part")
+        assert len(open_run(tmp_path / "part").gaussians["position"]) == found["kept"]
+
+
+def test_regions_are_met_together_and_move_with_the_world() -> None:
+    rng = np.random.default_rng(2)
+    xyz = rng.uniform(-3, 3, (500, 3))
+    poses = np.tile(np.eye(4), (5, 1, 1))
+    poses[:, :3, 3] = -rng.uniform(-1, 1, (5, 3))
+    region = Region([2, 2, 2, -2, -2, -2], [0, 0, 0, 2.5], 2.5, -1.0)
+    centres = -poses[:, :3, 3]
+    expected = (
+        (np.abs(xyz) <= 2).all(axis=1)
+        & (np.linalg.norm(xyz, axis=1) <= 2.5)
+        & (np.linalg.norm(xyz[:, None] - centres, axis=2).min(axis=1) <= 2.5)
+        & (-(xyz[:, 1] - np.median(centres[:, 1])) >= -1.0)  # y is down in a camera that is not turned
+    )
+    assert 20 < expected.sum() < 400
+    np.testing.assert_array_equal(region.contains(xyz, poses), expected)
+
+
+def test_less_is_taken_where_all_would_cost_too_much() -> None:
+    """A quality that falls by 0.01 dB for each Gaussian of one kind, and rises for those of the other."""
+    faulty, dear = np.arange(40) < 8, (np.arange(40) >= 8) & (np.arange(40) < 24)
+
+    def score(there: NDArray[np.bool_]) -> float:
+        return 30.0 + 0.01 * (~there & faulty).sum() - 0.01 * (~there & dear).sum()
+
+    shows = np.arange(40)[::-1].astype(float)
+    taken, before, after = harmless({"good": faulty, "bad": dear}, shows, score, 0.05)
+    np.testing.assert_array_equal(taken["good"], faulty)
+    np.testing.assert_array_equal(np.flatnonzero(taken["bad"]), np.arange(16, 24))  # the half that shows least
+    assert (before, after) == (30.0, pytest.approx(30.0))
+    assert not harmless({"bad": dear}, shows, lambda there: 0.0 if there.all() else -9.0, 0.05)[0]["bad"].any()
