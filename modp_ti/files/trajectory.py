@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from array import array
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -61,6 +61,7 @@ def read_number_rows(
     few: float = 0.0,
     least: int = 1,
     quaternion: slice | None = None,
+    text: Iterable[str] | None = None,
 ) -> NumberRows:
     """Read a text table whose rows have `columns` finite numbers each.
 
@@ -73,6 +74,7 @@ def read_number_rows(
         few: Largest share of the rows that may contain NaN or Inf; these rows are skipped.
         least: Least number of rows, 0 or 1.
         quaternion: Where a row has a quaternion; rows in which it is zero are skipped as those with NaN are.
+        text: The lines of the file, where it lies in an archive.
 
     Raises:
         InputError: With file and line, if a row has another number of columns, text, too many rows contain NaN or Inf,
@@ -80,7 +82,7 @@ def read_number_rows(
     """
     values, lines = array("d"), array("q")
     bad: list[int] = []
-    for number, line in enumerate(input_lines(path, f" ({setting})"), start=1):
+    for number, line in enumerate(input_lines(path, f" ({setting})") if text is None else text, start=1):
         words = line.split("#", 1)[0].replace(",", " ").split()
         if not words:
             continue

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import math
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -18,7 +17,7 @@ from fields.geometry.se3 import inverse_se3
 from modp_ti.files import LARGEST, reading
 from modp_ti.files.errors import InputError
 from modp_ti.files.file_tree import SETTING, FileTree
-from modp_ti.files.trajectory import checked_pose
+from modp_ti.files.trajectory import checked_pose, read_number_rows
 from modp_ti.inputs.sources.distortion import NO_DISTORTION, Distortion
 from modp_ti.inputs.sources.image_header import read_image_header
 from modp_ti.inputs.sources.undistortion import require_plausible
@@ -186,35 +185,17 @@ def read_lines(tree: FileTree, name: str) -> list[tuple[int, str]]:
     return [(number, line) for number, line in lines if line]
 
 
-def read_numbers(tree: FileTree, name: str, columns: int, meaning: str, finite: bool = True) -> NDArray[np.float64]:
-    """Read rows of at least `columns` numbers, separated by blanks or commas. Further columns are ignored.
-
-    Args:
-        tree: The files.
-        name: Name of the file.
-        columns: Numbers per row.
-        meaning: The columns in words, for error messages.
-        finite: Whether NaN and infinite numbers are errors.
-
-    Returns:
-        The rows (N, columns).
+def read_numbers(tree: FileTree, name: str, columns: int, meaning: str, few: float = 0.0) -> NDArray[np.float64]:
+    """Read rows (N, columns) of numbers, separated by blanks or commas; see `read_number_rows`.
 
     Raises:
-        InputError: If the file cannot be read or has no rows; with the line, if a row has too few columns, text or
-            numbers beyond `LARGEST`.
+        InputError: If the file cannot be read or has no rows; with the line, if a row is faulty.
     """
-    rows = []
-    for number, line in read_lines(tree, name):
-        try:
-            row = [float(word) for word in line.replace(",", " ").split()[:columns]]
-        except ValueError:
-            row = []
-        if len(row) < columns or any(abs(v) > LARGEST if math.isfinite(v) else finite for v in row):
-            raise InputError(f"{tree.path / name}:{number}: is no row of {columns} finite numbers: {meaning}")
-        rows.append(row)
-    if not rows:
-        raise InputError(f"{tree.path / name}: holds no row of {meaning}")
-    return np.array(rows)
+    with reading(tree.path / name, SETTING):
+        text, least = tree.read_text(name).splitlines(), int(few < 1.0)
+        return read_number_rows(
+            tree.path / name, columns, meaning, "source.path", more=True, few=few, least=least, text=text
+        ).values
 
 
 def read_object(tree: FileTree, name: str, key: str) -> dict[str, Any]:

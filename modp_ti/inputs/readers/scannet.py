@@ -64,5 +64,5 @@ def _camera(tree: FileTree, file: str, images: dict[int, str]) -> PinholeCamera:
 
 def _pose(tree: FileTree, file: str) -> NDArray[np.float64] | None:
     """Read T_camera_world (4, 4); None if the tracker of the data set was lost."""
-    rows = read_numbers(tree, file, 4, "a row of a 4x4 matrix, camera to world", finite=False)
-    return opencv_pose(rows, f"{tree.path / file}") if np.isfinite(rows).all() else None
+    rows = read_numbers(tree, file, 4, "a row of a 4x4 matrix, camera to world", few=1.0)
+    return opencv_pose(rows, f"{tree.path / file}") if len(rows) == 4 else None

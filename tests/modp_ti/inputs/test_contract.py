@@ -38,7 +38,7 @@ def written(kind: str, folder: Path, filmed=SMALL) -> Path:
 
 
 def every(kinds) -> pytest.MarkDecorator:
-    return pytest.mark.parametrize("kind", kinds)
+    return pytest.mark.parametrize("kind", list(kinds))
 
 
 def assert_frames(frames) -> None:
