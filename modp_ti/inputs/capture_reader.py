@@ -15,12 +15,13 @@ from pydantic import Field
 
 from fields.frames.tracked_frame import SparsePoints
 from modp_ti.files import reading
-from modp_ti.files.errors import FEW, InputError
+from modp_ti.files.errors import InputError, UnreadableImageError
 from modp_ti.files.file_tree import SETTING, FileTree, open_tree
 from modp_ti.inputs.capture import Capture, CapturedFrame
 from modp_ti.inputs.depth_maps import depth_points
 from modp_ti.inputs.posed_recording import PosedRecording, StoredView
 from modp_ti.inputs.reader import PosesSettings, in_a_sentence, kind_of
+from modp_ti.inputs.replay import Unreadable
 from modp_ti.inputs.sources.image_folder import ListedImages
 from modp_ti.inputs.sources.orientation import Turn
 from modp_ti.inputs.sources.protocol import ImageSource
@@ -141,10 +142,10 @@ class DepthCaptureSettings(CaptureSettings):
     def _gives_depths(
         self, recording: PosedRecording, capture: Capture, captured: Sequence[CapturedFrame], turns: Sequence[Turn]
     ) -> bool:
-        """Damaged maps are left out, up to a share `FEW` of them."""
+        """Damaged maps are left out, up to a share `FEW` of the frames."""
         if not self.depth or capture.read_depth is None:
             return False
-        points, damaged = [], []
+        points, damaged = [], Unreadable()
         for index, (stored, turn, frame) in enumerate(zip(captured, turns, recording.frames, strict=True)):
             points.append(SparsePoints())
             if stored.depth is None:
@@ -152,13 +153,13 @@ class DepthCaptureSettings(CaptureSettings):
             try:
                 depth = capture.read_depth(capture.tree, stored)
             except OSError as error:
-                damaged.append(f"{capture.tree.path / stored.depth}: unreadable depth map: {error.strerror or error}")
+                where = f"{capture.tree.path / stored.depth}: unreadable depth map: {error.strerror or error}"
+                advice = "copy the capture again, or set tracker.depth: false"
+                damaged.add(stored.depth, UnreadableImageError(f"{where}; {advice}"), len(captured))
                 continue
             points[-1] = depth_points(depth, stored, turn, frame, index, self.max_points, self.max_depth)
-        if len(damaged) > FEW * len(points):
-            raise InputError(f"{damaged[0]}; copy the capture again, or set tracker.depth: false")
         if damaged:
-            recording.notes.append(f"{len(damaged)} depth maps are damaged: left out (the first: {damaged[0]})")
+            recording.notes.append(damaged.note(len(captured)))
         given = iter(points)
         return recording.add_points(lambda _: next(given))
 

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import inverse_se3, matrix_from_quaternion, quaternion_from_matrix
+from modp_ti.inputs.capture import OPENCV_OPENGL
 
-OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 # From the axes of a body in ROS (x forward, y left, z up) to those of its camera.
 BODY = np.array([[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 
@@ -57,7 +57,7 @@ class Convention:
             return np.vstack([np.c_[R.T, -R.T @ centre], [0.0, 0.0, 0.0, 1.0]])
         if self.body:
             return BODY @ T
-        return OPENGL @ T if self.opengl else T
+        return OPENCV_OPENGL @ T if self.opengl else T
 
     def camera(self, camera: PinholeCamera) -> PinholeCamera:
         """The correct camera under this interpretation, for the same image size."""

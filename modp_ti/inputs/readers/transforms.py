@@ -12,7 +12,7 @@ from pydantic import Field
 
 from fields.geometry.camera import PinholeCamera
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.capture import opengl_pose
+from modp_ti.inputs.capture import checked_numbers, opengl_pose
 from modp_ti.inputs.point_cloud import read_ply_points, visible_points
 from modp_ti.inputs.posed_recording import PANORAMAS, PosedRecording, StoredView, read_entries
 from modp_ti.inputs.reader import RecordedSettings
@@ -108,11 +108,7 @@ def _camera(
 
     def number(key: str) -> float | None:
         value = values.get(key)
-        if value is None:
-            return None
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-            raise InputError(f"{what}: `{key}` must be a number, not {str(value)[:60]!r}")
-        return float(value)
+        return None if value is None else checked_numbers(value, 1, f"{what}: `{key}`")[0]
 
     width, height = number("w"), number("h")
     if width is None or height is None:
