@@ -33,6 +33,7 @@ EXAMPLES = {
         "modp-ti render out/room --path orbit --size 1280x720 --fov 70 -o orbit.webm",
         "modp-ti render out/room --show depth -o depth/   (float32 TIFF files)",
         "modp-ti render out/room --path mine.txt -o pictures/   (poses of your own)",
+        "modp-ti render out/room --path smoothed --panorama 4096   (seen all round)",
     ),
     "export": examples(
         "modp-ti export out/room --format html   (one page for a friend)",
@@ -100,8 +101,17 @@ def render(
         ),
     ] = "recorded",
     show: Annotated[
-        Literal["colour", "depth"], typer.Option(help="in a folder, depth is float32 TIFF in scene units")
+        Literal["colour", "depth", "normals"],
+        typer.Option(help="depth is in scene units; normals are in the camera's axes: x right, y down, z ahead"),
     ] = "colour",
+    encoding: Annotated[
+        Literal["tiff", "exr", "png"] | None,
+        typer.Option(help="of depth and normals in a folder: `tiff` and `exr` are float32, `png` 16 bits; empty: tiff"),
+    ] = None,
+    panorama: Annotated[
+        int | None,
+        typer.Option(metavar="WIDTH", min=64, max=6400, help="equirectangular pictures, half as high as wide"),
+    ] = None,
     size: Annotated[str | None, typer.Option(metavar="WIDTHxHEIGHT", help="of the pictures; empty: as mapped")] = None,
     fov: Annotated[
         float | None, typer.Option(min=1, max=150, help="horizontal field of view in degrees; empty: as recorded")
@@ -128,12 +138,12 @@ def render(
         from modp_ti.outputs.playback.film import film, is_video, plan_flight
 
         run, line = _opened(out, quiet)
-        target = output or run.folder / f"{Path(path).stem}{'-depth' if show == 'depth' else ''}.mp4"
+        target = output or run.folder / f"{Path(path).stem}{'' if show == 'colour' else f'-{show}'}.mp4"
         if fps is not None and not is_video(target):
             raise InputError(f"--fps: is for videos, and {target} is a folder of pictures: leave it out")
         pixels = None if size is None else picture_size(size)
-        flight = plan_flight(run, path, pixels, fov, frames, fps, smooth, exposure)
-        film(run, flight, target, show == "depth", device, line)
+        flight = plan_flight(run, path, pixels, fov, frames, fps, smooth, exposure, panorama)
+        film(run, flight, target, show, device, line, encoding)
         result.text = f"written to {target}"
         result.data = {"output": str(target.absolute()), "pictures": len(flight.poses)}
 

@@ -55,7 +55,7 @@ class VoxelSpace:
         """Return the height of the largest level surface below a height, in the grid's axes; None without any."""
         top = (self.state[:, :, :-1] == SOLID) & (self.state[:, :, 1:] == FREE)
         area = top.sum(axis=(0, 1))[: max(int(below / self.voxel) - self.first[2], 0)]
-        return float(self.voxel * (self.first[2] + 1 + area.argmax())) if area.any() else None
+        return float(self.voxel * (self.first[2] + 0.5 + area.argmax())) if area.any() else None
 
 
 def carved(

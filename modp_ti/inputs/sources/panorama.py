@@ -71,6 +71,13 @@ class Projection:
         found = np.stack([centre + share * x, 0.5 * self.height + share * y], axis=-1)
         return np.where((angle <= 0.5 * self.lens_fov)[..., None], found, np.nan)
 
+    def rays(self) -> NDArray[np.float64]:
+        """Unit rays (H, W, 3) of the pixels' centres of an equirectangular image."""
+        across = 2.0 * np.pi * ((np.arange(self.width) + 0.5) / self.width - 0.5)
+        down = np.pi * ((np.arange(self.height) + 0.5) / self.height - 0.5)[:, None]
+        level = np.cos(down)
+        return np.stack([level * np.sin(across), np.sin(down) + 0.0 * across, level * np.cos(across)], axis=-1)
+
 
 @dataclass(frozen=True)
 class Face:

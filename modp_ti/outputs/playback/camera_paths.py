@@ -83,6 +83,13 @@ def looking_at(eye: NDArray[np.float64], target: NDArray[np.float64], up: NDArra
     return T
 
 
+def upright(T_camera_world: NDArray[np.float64], down: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return T_camera_world (4, 4) turned such that the horizon is level and in the middle, given down (3,)."""
+    eye = camera_centres(T_camera_world[None])[0]
+    ahead = T_camera_world[2, :3] - 1e-3 * T_camera_world[1, :3]  # of a camera that looks down, its picture's top
+    return looking_at(eye, eye + ahead - (ahead @ down) * down, -down)
+
+
 def _focus(centres: NDArray[np.float64], forward: NDArray[np.float64], depth: float) -> NDArray[np.float64]:
     """Return the point (3,) nearest to all optical axes, regularised towards the points on them at `depth`."""
     across = np.eye(3) - forward[:, :, None] * forward[:, None, :]

@@ -216,7 +216,7 @@ def _write_images(run: FinishedRun, folder: Path, line: ProgressLine) -> list[st
 
 
 def _video(run: FinishedRun, target: Path, options: ExportOptions, line: ProgressLine) -> None:
-    film(run, plan_flight(run, "recorded"), target, False, options.device, line)
+    film(run, plan_flight(run, "recorded"), target, "colour", options.device, line)
 
 
 # ---- the mesh ----------------------------------------------------------------------------------------------------

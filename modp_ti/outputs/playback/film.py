@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from fractions import Fraction
 from itertools import chain
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -16,14 +17,21 @@ from fields.frames.origin import shifted_poses
 from fields.geometry.camera import PinholeCamera
 from modp_ti.files.atomic import written_aside
 from modp_ti.files.errors import InputError
+from modp_ti.outputs.formats.compressed_splats import HALF_TURN
 from modp_ti.outputs.formats.dataset import new_folder
+from modp_ti.outputs.formats.mesh import LARGEST_STEP
 from modp_ti.outputs.formats.run_files import read_exposures
 from modp_ti.outputs.formats.trajectory import read_trajectory
-from modp_ti.outputs.playback.camera_paths import orbit, smoothed
+from modp_ti.outputs.playback.camera_paths import orbit, smoothed, upright
 from modp_ti.outputs.playback.finished_run import FinishedRun
 from modp_ti.outputs.playback.map_renderer import MapRenderer, eight_bits, start_device
+from modp_ti.outputs.playback.panoramas import PanoramaRenderer
 from modp_ti.outputs.progress import ProgressLine
+from modp_ti.outputs.splat_page.page import level
 from pipelines.render.renderer import RenderedView
+
+Shown = Literal["colour", "depth", "normals"]
+Encoding = Literal["tiff", "exr", "png"]
 
 # Codec by suffix, its options, and those of the file, whose index stands in front so that a browser plays while it
 # loads. Every browser plays both; H.264 is much faster to write.
@@ -55,26 +63,47 @@ def is_video(path: Path) -> bool:
     return suffix in VIDEO_SUFFIXES
 
 
-def write_pictures(folder: Path, views: Iterable[RenderedView], depth: bool) -> None:
-    """Write one file per view, from 000000. The folder appears whole or not at all.
+def write_pictures(folder: Path, pictures: Iterable[NDArray], encoding: Encoding = "tiff", unit: float = 1.0) -> None:
+    """Write one file per picture, from 000000. The folder appears whole or not at all.
 
     Args:
         folder: The folder, which must be new or empty.
-        views: The views.
-        depth: Write TIFF files with float32 z [scene units], 0 where nothing is, instead of PNG files.
+        pictures: Colours (H, W, 3) uint8, depths (H, W) or unit normals (H, W, 3).
+        encoding: Of depths and normals: "tiff" and "exr" with float32 values, or "png" with 16 bits, 0 where unknown.
+            Colours are always PNG.
+        unit: Of "png": a step of the depth [scene units]. Of normals, [-1, 1] are 1 to 65535.
 
     Raises:
         InputError: If the files cannot be written.
     """
     try:
         with new_folder(folder) as partial:
-            for number, view in enumerate(views):
-                if depth:
-                    cv2.imwrite(str(partial / f"{number:06d}.tiff"), view.expected_depth().astype(np.float32))
-                else:
-                    cv2.imwrite(str(partial / f"{number:06d}.png"), eight_bits(view.colour)[..., ::-1])
+            for number, picture in enumerate(pictures):
+                form: Encoding = "png" if picture.dtype == np.uint8 else encoding
+                (partial / f"{number:06d}.{form}").write_bytes(_encoded(picture, form, unit))
+                if number == 0 and form == "png" and picture.ndim == 2:
+                    (partial / "unit.json").write_text(f'{{"scene_units": {unit:g}}}\n')
     except OSError as error:
         raise InputError(f"{folder}: cannot be written: {error.strerror}") from None
+
+
+def _encoded(picture: NDArray, form: Encoding, unit: float) -> bytes:
+    if picture.dtype != np.uint8:
+        known = picture != 0 if picture.ndim == 2 else picture.any(axis=2, keepdims=True)
+        picture = picture.astype(np.float32)
+        if form == "png":
+            steps = picture / unit if picture.ndim == 2 else 32768.0 + 32767.0 * picture
+            picture = np.where(known & (steps < 65535.5), np.round(steps), 0).astype(np.uint16)
+    if form == "exr":
+        import av
+
+        encoder = av.CodecContext.create("exr", "w")
+        assert isinstance(encoder, av.VideoCodecContext)
+        encoder.height, encoder.width = picture.shape[:2]
+        encoder.pix_fmt, encoder.time_base = "gbrpf32le" if picture.ndim == 3 else "grayf32le", Fraction(1)
+        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format=encoder.pix_fmt)
+        return b"".join(bytes(packet) for packet in [*encoder.encode(frame), *encoder.encode(None)])
+    return cv2.imencode(f".{form}", picture[..., ::-1] if picture.ndim == 3 else picture)[1].tobytes()
 
 
 def write_video(path: Path, pictures: Iterable[NDArray[np.uint8]], frames_per_second: float) -> None:
@@ -124,6 +153,24 @@ def depth_colours(view: RenderedView, scene_depth: float) -> NDArray[np.uint8]:
     return np.where(z[..., None] > 0, colours, 0).astype(np.uint8)
 
 
+def normals(rays: NDArray[np.float64], depth: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return the unit normals (H, W, 3) of the surface that a view shows, towards the camera; 0 where unknown.
+
+    Args:
+        rays: (H, W, 3) rays of the pixels; a point is its depth times its ray.
+        depth: (H, W) depth, 0 where unknown. Across a step of the depth, the surface is not connected.
+    """
+    points, tangents = rays * depth[..., None], []
+    for axis in (0, 1):
+        least = np.minimum(np.delete(depth, 0, axis), np.delete(depth, -1, axis))
+        same = (least > 0) & (np.abs(np.diff(depth, axis=axis)) <= LARGEST_STEP * least)
+        step = np.where(same[..., None], np.diff(points, axis=axis), 0.0)
+        none = np.zeros_like(np.take(points, [0], axis))
+        tangents.append(np.concatenate([step, none], axis=axis) + np.concatenate([none, step], axis=axis))
+    n = np.cross(*tangents)
+    return n / np.maximum(np.linalg.norm(n, axis=2, keepdims=True), 1e-30)
+
+
 @dataclass(frozen=True)
 class Flight:
     """A planned film.
@@ -133,12 +180,14 @@ class Flight:
         cameras: Camera at each pose.
         frames_per_second: Frame rate.
         exposures: (3, 4) matrix (A, b) at each pose, which maps colours to A colour + b. None for the map's colours.
+        panorama: Width of equirectangular pictures [px]; None for those of the cameras.
     """
 
     poses: NDArray[np.float64]
     cameras: list[PinholeCamera]
     frames_per_second: float
     exposures: list[NDArray[np.float64]] | None = None
+    panorama: int | None = None
 
 
 def plan_flight(
@@ -150,6 +199,7 @@ def plan_flight(
     fps: float | None = None,
     deviation: float | None = None,
     exposure: bool = False,
+    panorama: int | None = None,
 ) -> Flight:
     """Plan a flight along a path.
 
@@ -162,6 +212,7 @@ def plan_flight(
         fps: Frame rate, None for that of the path's time stamps.
         deviation: Standard deviation of the smoothing of a smoothed path [frames], None for the default.
         exposure: Apply each frame's exposure. Only for the recorded path.
+        panorama: Width of equirectangular pictures [px]. But for a path of one's own, their horizon is made level.
 
     Raises:
         InputError: If the path is unknown, its file is invalid, an option is given that the path ignores, or the
@@ -174,6 +225,8 @@ def plan_flight(
     ):
         if given and path not in of:
             raise InputError(f"{option}: is for --path {' and '.join(of)}, not for {path}: leave it out")
+    if panorama is not None and (size is not None or fov is not None):
+        raise InputError("--panorama: has its own size and sees all round; leave out --size and --fov")
     times = None
     cameras = [run.cameras[run.record.keyframes[0]]]
     if path == "smoothed":
@@ -192,29 +245,44 @@ def plan_flight(
         raise InputError(f"--path {path}: holds no pose")
     if len(cameras) < len(poses):
         cameras *= len(poses)
+    if panorama is not None and path in PATHS:
+        down = level(run.poses, run.record.scene_depth).R[1]
+        poses = np.stack([upright(T, down) for T in poses])
     return Flight(
         poses,
         [_lens(camera, size, fov) for camera in cameras],
         fps or _rate(times),
         _exposures(run) if exposure else None,
+        panorama,
     )
 
 
-def film(run: FinishedRun, flight: Flight, output: Path, depth: bool, device: str, line: ProgressLine) -> None:
+def film(
+    run: FinishedRun,
+    flight: Flight,
+    output: Path,
+    show: Shown,
+    device: str,
+    line: ProgressLine,
+    encoding: Encoding | None = None,
+) -> None:
     """Render a flight to a video or a folder of pictures, depending on the name of `output`.
 
     Args:
         run: The finished run.
         flight: The planned flight.
         output: A video file or a new folder.
-        depth: Render depth instead of colour.
+        show: What is rendered.
         device: "cpu", "cuda", "vulkan", "metal" or "auto".
         line: Shows the progress.
+        encoding: Of depth and normals in a folder, None for the default.
 
     Raises:
         InputError: If the output cannot be written. This is checked before rendering.
     """
     video = is_video(output)
+    if encoding is not None and (video or show == "colour"):
+        raise InputError("--encoding: is for a folder of depth or normals; leave it out")
     if not output.absolute().parent.is_dir():
         raise InputError(f"{output.absolute().parent}: no such folder; make it first")
     if output.is_dir() if video else output.exists() and not (output.is_dir() and not any(output.iterdir())):
@@ -222,23 +290,32 @@ def film(run: FinishedRun, flight: Flight, output: Path, depth: bool, device: st
     with line.working("loading the map"):
         gaussians = run.gaussians
         start_device(device)
-        width, height = (max(getattr(c, side) for c in flight.cameras) for side in ("width", "height"))
-        renderer = MapRenderer(gaussians, width, height, run.record.near)
+        if flight.panorama is None:
+            width, height = (max(getattr(c, side) for c in flight.cameras) for side in ("width", "height"))
+            renderer = MapRenderer(gaussians, width, height, run.record.near)
+        else:
+            renderer = PanoramaRenderer(gaussians, flight.panorama, run.record.near)
 
-    def views() -> Iterator[RenderedView]:
+    def pictures() -> Iterator[NDArray]:
         exposures = flight.exposures or [None] * len(flight.poses)
         shots = list(zip(flight.cameras, flight.poses, exposures, strict=True))
         for camera, T, exposure in line.through("rendering", shots, len(shots)):
             view = renderer.view(camera, T)
-            yield view if exposure is None else replace(view, colour=view.colour @ exposure[:, :3].T + exposure[:, 3])
-
-    def shown(view: RenderedView) -> NDArray[np.uint8]:
-        return depth_colours(view, run.record.scene_depth) if depth else eight_bits(view.colour)
+            if show == "colour":
+                developed = view.colour if exposure is None else view.colour @ exposure[:, :3].T + exposure[:, 3]
+                yield eight_bits(developed)
+            elif show == "depth":
+                yield depth_colours(view, run.record.scene_depth) if video else view.expected_depth()
+            else:
+                n = normals(renderer.rays(camera), view.expected_depth())
+                yield eight_bits(n.any(axis=2, keepdims=True) * (0.5 + 0.5 * n * HALF_TURN)) if video else n
 
     if video:
-        write_video(output, map(shown, views()), flight.frames_per_second)
+        write_video(output, pictures(), flight.frames_per_second)
     else:
-        write_pictures(output, views(), depth)
+        # The power of ten of which 65,535 steps reach between 8 and 80 scene depths far: millimetres in a room.
+        unit = 10.0 ** np.ceil(np.log10(8.0 * run.record.scene_depth / 65535))
+        write_pictures(output, pictures(), encoding or "tiff", unit)
 
 
 def _exposures(run: FinishedRun) -> list[NDArray[np.float64]]:

@@ -13,6 +13,7 @@ from fields.runtime.backend import on_gpu
 from fields.runtime.engine import engine
 from fields.runtime.tenancy import ensure_started, in_engine, settled
 from modp_ti.files.errors import InputError
+from modp_ti.inputs.sources.panorama import Face
 from pipelines.render.renderer import RenderedView, Renderer
 from pipelines.whole.hierarchy import ShownMap
 
@@ -85,6 +86,10 @@ class MapRenderer:
         if not self._shown.fits:
             self._shown.show(camera, T_camera_world)
         return self.renderer.render(camera, T_camera_world, self.near)
+
+    def rays(self, camera: PinholeCamera) -> NDArray[np.float64]:
+        """Return the rays (H, W, 3) of a view's pixels: a point is its depth times its ray."""
+        return Face(camera, np.eye(4)).rays()
 
     def picture(self, camera: PinholeCamera, T_camera_world: NDArray[np.float64]) -> NDArray[np.uint8]:
         """Render the map's colours (H, W, 3) as 8-bit values."""

@@ -100,6 +100,20 @@ def test_depth_is_that_of_the_room(out: Path, tmp_path: Path) -> None:
     assert z.dtype == np.float32 and z.shape == (60, 80)
     assert (z > 0).mean() > 0.5
     assert 1.0 < np.median(z[z > 0]) < 4.0
+    folder = done("render", out, "-o", tmp_path / "png", "--show", "depth", "--encoding", "png")
+    unit = json.loads((folder / "unit.json").read_text())["scene_units"]
+    steps = cv2.imread(str(folder / "000004.png"), cv2.IMREAD_UNCHANGED)
+    assert unit == 0.001 and np.abs(unit * steps - z).max() <= 0.51 * unit
+
+
+def test_a_panorama_is_level_and_holds_the_recorded_view(out: Path, tmp_path: Path) -> None:
+    folder = done("render", out, "-o", tmp_path / "around", "--panorama", 256)
+    pictures = [cv2.imread(str(folder / f"{i:06d}.png")) for i in range(9)]
+    assert all(picture.shape == (128, 256, 3) for picture in pictures)
+    seen = pictures[4].astype(float).max(axis=2) > 30
+    assert seen[:, 96:160].mean() > 2 * seen[:, :64].mean()  # ahead, and not behind
+    film = done("render", out, "-o", tmp_path / "around.mp4", "--panorama", 256, "--show", "normals")
+    assert cv2.VideoCapture(str(film)).get(cv2.CAP_PROP_FRAME_COUNT) == 9
 
 
 def test_a_video_has_the_frames_and_the_size_that_were_asked_for(out: Path, tmp_path: Path) -> None:
@@ -286,6 +300,8 @@ def failure(*arguments: str | Path) -> str:
         ("render --frames 5", "--frames"),
         ("render --smooth 5", "--smooth"),
         ("render --fps 5 -o pictures", "--fps"),
+        ("render --panorama 512 --fov 90", "--panorama"),
+        ("render --show normals --encoding png", "--encoding"),
         ("render -o {out}", "{out}"),
     ],
 )
