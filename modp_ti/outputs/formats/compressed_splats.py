@@ -229,12 +229,13 @@ def packed(parts: NDArray[np.float64] | list[NDArray[np.float64]], bits: tuple[i
 
 
 def morton_order(position: NDArray[np.floating]) -> NDArray[np.int64]:
-    """Return the order (N,) along a Morton curve with 10 bits per coordinate."""
+    """Return the order (N,) along a Morton curve with 10 bits per coordinate. What is far outside, as sky, is last."""
     if len(position) == 0:
         return np.zeros(0, np.int64)
-    low, high = position.min(axis=0), position.max(axis=0)
-    cell = to_bits((position - low) / np.maximum(high - low, 1e-12), 10).astype(np.uint64)
-    key = np.zeros(len(position), np.uint64)
+    low, high = np.quantile(position, [0.02, 0.98], axis=0)
+    place = ((position - low) / np.maximum(high - low, 1e-12) + 1.0) / 3.0
+    cell = to_bits(place, 10).astype(np.uint64)
+    key = ((place < 0.0) | (place > 1.0)).any(axis=1).astype(np.uint64) << np.uint64(30)
     for bit in range(10):
         for axis in range(3):
             key |= (cell[:, axis] >> np.uint64(bit) & np.uint64(1)) << np.uint64(3 * bit + axis)
