@@ -135,7 +135,7 @@ def area(points: Sequence[SurfacePoint]) -> tuple[float, float]:
     size = float(np.linalg.norm(vector))
     normal = vector / max(size, 1e-300)
     slopes = 0.5 * np.cross(np.roll(xyz, -1, axis=0) - np.roll(xyz, 1, axis=0), normal)
-    return size, _deviation(slopes, points)
+    return size, _deviation(np.asarray(slopes, dtype=np.float64), points)
 
 
 def _deviation(slopes: NDArray[np.float64], points: Sequence[SurfacePoint]) -> float:
