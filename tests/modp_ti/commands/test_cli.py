@@ -31,7 +31,8 @@ from modp_ti.files.errors import InputError
 from tests.patience import PATIENCE
 
 PROJECT = Path(__file__).resolve().parents[3]
-COMMANDS = ["run", "batch", "refine", "cameras", "check", "render", "export", "measure", "locate", "view", "warmup"]
+COMMANDS = ["run", "batch", "refine", "clean", "crop", "cameras", "check"]
+COMMANDS += ["render", "export", "measure", "locate", "view", "warmup"]
 HEAVY = "('taichi', 'quadrants', 'torch', 'open3d', 'cv2', 'pycolmap')"
 
 
