@@ -138,6 +138,11 @@ class DensifySettings(StrictModel):
     )
     scale_offset: float = Field(default=0.5, description="added to the log of that size (epsilon of Eq. 1)")
     initial_opacity: float = Field(default=0.5, gt=0, lt=1, description="opacity of a new Gaussian")
+    sky: bool = Field(
+        default=True,
+        description="add wide Gaussians in smooth regions at the upper edge of an image that the map does not show "
+        "yet, far away where no depth is known",
+    )
     min_contribution: float = Field(
         default=0.5,
         ge=0,

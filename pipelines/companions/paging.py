@@ -23,6 +23,8 @@ from pipelines.settings import MappingSettings
 SIDE = 0.125
 # Share of a limit that is used after blocks have gone to disk, so that they go rarely.
 KEPT = 0.9
+# Width from which on blocks always stay in memory [scene depths]. Blocks hold Gaussians of about one size.
+SKY = 3.0
 # Size of a group of keyframes: Gaussians that they see together, over the number that fit. In smaller groups, fewer
 # blocks are moved, but what two groups see is optimised for one after the other, which is worse than for both at once.
 TOGETHER = 1.5
@@ -235,7 +237,9 @@ class Paging(Companion):
         if self.problem is not None or min(self._spare(nbytes)) >= gaussians:
             return
         blocks = self._divided()
-        free = np.flatnonzero(~seen(planes_of_views(views), blocks.boxes).any(axis=0))
+        # Wide Gaussians are the sky, which a view sees at any distance.
+        sky = (blocks.boxes.high - blocks.boxes.low).min(axis=1) > SKY * self.keyframes.scene_depth
+        free = np.flatnonzero(~seen(planes_of_views(views), blocks.boxes).any(axis=0) & ~sky)
         if views:
             free = free[_by_distance(blocks.boxes[free], views[0])[::-1]]
         pool, memory = self._spare(nbytes, KEPT)

@@ -13,14 +13,13 @@ from fields.map.keyframe import Keyframe
 from fields.map.keyframes import KeyframeStore
 from fields.voxels.occupancy import OccupancyVoxels
 from pipelines.densify.depth.estimate import DepthEstimator
-from pipelines.densify.growth import Seeds, dissimilarity, error_pixels, grow, pixel_seeds, tracked_seeds
+from pipelines.densify.growth import HOLE, Seeds, dissimilarity, error_pixels, grow, pixel_seeds, tracked_seeds
+from pipelines.densify.sky import sky_pixels, sky_seeds
 from pipelines.optimise.map_optimiser import MapOptimiser
 from pipelines.pipeline import Stopwatch
 from pipelines.safeguards import MemoryBudget
 from pipelines.settings import MappingSettings
 
-# A pixel whose rendered opacity is below this counts as a hole.
-HOLE = 0.5
 # Gaussians whose voxels are marked together, before those rest of which no Gaussian is resident.
 MARKED_TOGETHER = 1 << 17
 
@@ -85,7 +84,7 @@ class Densifier:
         self._grow(tracked_seeds(view), view, len(self.anchors) - 1)
 
     def add_error_pixels(self, view: Keyframe, warming_up: bool, share: float = 1.0) -> None:
-        """Add Gaussians at pixels of high error of a keyframe. Call `add_tracked_points` first.
+        """Add Gaussians at a keyframe's pixels of high error and where it may show sky. First, `add_tracked_points`.
 
         Args:
             view: The keyframe, or a level of it. Of an earlier one, depth is matched in later keyframes as well.
@@ -98,12 +97,18 @@ class Densifier:
             error = None if warming_up else dissimilarity(images.colour_to_numpy(), view.rgba)
             opacity = images.opacity_to_numpy()
             pixels = error_pixels(view, error, self.settings.densify, self._rng, share)
+            count = len(pixels)
+            sky = sky_pixels(view, opacity) if self.settings.densify.sky else np.zeros((0, 2))
             column, row = np.floor(pixels).astype(int).T
             depth = self.settings.depth
             limit = np.where(opacity[row, column] < HOLE, depth.hole_deviation, depth.max_deviation)
             neighbours = self.keyframes.around(view.index, depth.neighbours)
-            seeds = pixel_seeds(view, neighbours, pixels, self.depth, limit, depth.max_misplacement)
+            estimate = self.depth.estimate(view, neighbours, np.concatenate([pixels, sky]))
+            seeds = pixel_seeds(view, neighbours, pixels, estimate[:count], limit, depth.max_misplacement)
         self._grow(seeds, view, self.first_anchor_since(view))
+        # Without voxels, whose cells the wide Gaussians would close for narrow ones.
+        seeds = sky_seeds(view, sky, estimate[count:])
+        grow(self.gaussians, seeds, None, 0.0, self.settings.densify, self.budget, self.first_anchor_since(view))
 
     def _grow(self, seeds: Seeds, view: Keyframe, anchor: int) -> None:
         """Add Gaussians at the seeds that the voxels admit. The first seeds settle the voxels around the camera."""

@@ -14,12 +14,14 @@ from fields.map.gaussians import NO_ANCHOR, SH_C0, GaussianField
 from fields.map.keyframe import Keyframe
 from fields.voxels.occupancy import OccupancyVoxels
 from pipelines.companions.exposure import scene_colours
-from pipelines.densify.depth.estimate import DepthEstimator, misplacement
+from pipelines.densify.depth.estimate import DepthEstimate, misplacement
 from pipelines.safeguards import MemoryBudget
 from pipelines.settings import DensifySettings
 
 # Deviation of log depth from which a depth contains no information.
 UNKNOWN = 0.5
+# A pixel whose rendered opacity is below this counts as a hole.
+HOLE = 0.5
 
 
 @dataclass(frozen=True)
@@ -111,11 +113,18 @@ def error_pixels(
     return np.stack([chosen % width + 0.5, chosen // width + 0.5], axis=1)
 
 
+def seeds_at(view: Keyframe, pixels: NDArray[np.float64], depth: NDArray[np.float64]) -> Seeds:
+    """Seeds at pixels (N, 2) of a view with these depths (N,), except those on masked pixels."""
+    T_world_camera = inverse_se3(view.T_camera_world)
+    xyz = view.camera.unproject(pixels, depth) @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+    return _at_pixels(view, pixels, xyz, depth)
+
+
 def pixel_seeds(
     view: Keyframe,
     neighbours: Sequence[Keyframe],
     pixels: NDArray[np.float64],
-    estimator: DepthEstimator,
+    estimate: DepthEstimate,
     max_deviation: float | NDArray[np.float64],
     max_misplacement: float = 0.0,
 ) -> Seeds:
@@ -123,22 +132,18 @@ def pixel_seeds(
 
     Args:
         view: The view of the pixels.
-        neighbours: Keyframes that the estimator may use.
+        neighbours: Other keyframes.
         pixels: Pixels (N, 2) as (x, y).
-        estimator: Depth estimator.
+        estimate: Their depths.
         max_deviation: Standard deviation of log depth, a scalar or (N,), below which the depth is certain.
         max_misplacement: Misplacement below which an uncertain depth is used all the same, see `misplacement` [px].
     """
-    estimate = estimator.estimate(view, neighbours, pixels)
     sure = estimate.deviation < max_deviation
     if max_misplacement > 0:
         unsure = np.flatnonzero(~sure & (estimate.deviation < UNKNOWN))
         moved = misplacement(view, neighbours, pixels[unsure], estimate.depth[unsure], estimate.deviation[unsure])
         sure[unsure[moved < max_misplacement]] = True
-    camera_points = view.camera.unproject(pixels[sure], estimate.depth[sure])
-    T_world_camera = inverse_se3(view.T_camera_world)
-    xyz = camera_points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
-    return _at_pixels(view, pixels[sure], xyz, estimate.depth[sure])
+    return seeds_at(view, pixels[sure], estimate.depth[sure])
 
 
 def grow(

@@ -25,6 +25,9 @@ class DepthEstimate:
     depth: NDArray[np.float64]
     deviation: NDArray[np.float64]
 
+    def __getitem__(self, keep: slice) -> DepthEstimate:
+        return DepthEstimate(self.depth[keep], self.deviation[keep])
+
 
 class DepthEstimator(Protocol):
     """Protocol of a depth estimator for high-error pixels (Section 3.2.2)."""

@@ -93,6 +93,18 @@ def test_a_part_that_is_left_is_found_as_it_was_left(taichi_on_the_cpu: None) ->
         np.testing.assert_array_equal(array[place : place + len(was)], was[name])
 
 
+def test_the_sky_is_never_put_away(taichi_on_the_cpu: None) -> None:
+    mapper = walk(mapper_of(), end=3)
+    depth = mapper.keyframes.scene_depth
+    far = depth * np.array([[0.0, -30.0, 40.0], [30.0, -20.0, 35.0]])
+    state = {name: array[:2] for name, array in mapper.gaussians.to_numpy().items()}
+    state |= {"position": far, "log_scale": np.full((2, 3), np.log(1.1 * depth))}
+    mapper.gaussians.append(**state, anchor=0)
+    walk(mapper, 3, OUT)
+    assert len(mapper.paging.away) > 0
+    assert (np.linalg.norm(mapper.gaussians.to_numpy()["position"], axis=1) > 40 * depth).sum() == 2
+
+
 def test_voxels_that_rest_change_nothing(taichi_on_the_cpu: None, monkeypatch: pytest.MonkeyPatch) -> None:
     mapper = walk(mapper_of())
     rests = mapper.densifier.voxels.marks()[2]

@@ -109,7 +109,7 @@ def test_an_image_that_is_mostly_wrong_has_error_pixels_in_proportion() -> None:
 
 def test_pixel_seeds_lie_on_their_rays_at_the_estimated_depth_where_it_is_known() -> None:
     pixels = np.array([[10.5, 20.5], [70.5, 100.5], [120.5, 60.5]])
-    seeds = pixel_seeds(view(), [], pixels, Wall(), 0.06)
+    seeds = pixel_seeds(view(), [], pixels, Wall().estimate(view(), [], pixels), 0.06)
     local = seeds.xyz @ POSE[:3, :3].T + POSE[:3, 3]
     np.testing.assert_allclose(local[:, 2], 5.0)
     np.testing.assert_allclose(CAMERA.project(local), pixels[:2])
@@ -131,11 +131,12 @@ def test_an_uncertain_pixel_is_seeded_where_its_error_would_hardly_be_seen() -> 
             return DepthEstimate(np.full(len(pixels), 5.0), np.where(pixels[:, 0] < 80, 0.01, 0.4))
 
     v = view()
+    vague, wall = (estimator.estimate(v, [], pixels) for estimator in (Vague(), Wall()))
     near, far = [sideways(v, 0.1)], [sideways(v, 1.0)]  # 0.7 and 6.6 px
-    assert len(pixel_seeds(v, near, pixels, Vague(), 0.06)) == 1
-    assert len(pixel_seeds(v, near, pixels, Vague(), 0.06, max_misplacement=2.0)) == 2
-    assert len(pixel_seeds(v, far, pixels, Vague(), 0.06, max_misplacement=2.0)) == 1
-    assert len(pixel_seeds(v, near, pixels, Wall(), 0.06, max_misplacement=2.0)) == 1  # a deviation of 1 says nothing
+    assert len(pixel_seeds(v, near, pixels, vague, 0.06)) == 1
+    assert len(pixel_seeds(v, near, pixels, vague, 0.06, max_misplacement=2.0)) == 2
+    assert len(pixel_seeds(v, far, pixels, vague, 0.06, max_misplacement=2.0)) == 1
+    assert len(pixel_seeds(v, near, pixels, wall, 0.06, max_misplacement=2.0)) == 1  # a deviation of 1 says nothing
 
 
 @pytest.fixture(scope="module")
