@@ -6,6 +6,7 @@
 The order and the signs of the harmonics are those of 3DGS files, and so are their colours, which are sRGB. The schema
 has no flag for anti-aliasing.
 """
+# pyright: reportAttributeAccessIssue=false
 
 from __future__ import annotations
 
