@@ -61,7 +61,7 @@ def _options(
 
 EXAMPLES = {"run": run.EXAMPLES, "batch": batch.EXAMPLES, **finished.EXAMPLES, **edit.EXAMPLES, **input.EXAMPLES}
 for command in (
-    *(run.run, batch.batch, finished.refine, edit.clean, edit.crop, input.cameras, input.check),
+    *(run.run, batch.batch, finished.refine, edit.clean, edit.crop, edit.scale, input.cameras, input.check),
     *(finished.render, finished.export, finished.measure, finished.locate, finished.view, input.warmup),
 ):
     app.command(epilog=EXAMPLES[command.__name__])(command)

@@ -1,13 +1,13 @@
-"""`modp-ti clean` and `modp-ti crop`: a finished map without its faults, or a part of it, in a new folder."""
+"""`modp-ti clean`, `crop` and `scale`: a finished map without faults, a part of it, or in metres, in a new folder."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
-from modp_ti.commands.finished import Out
+from modp_ti.commands.finished import Out, opened
 from modp_ti.commands.shared import AsJson, Quiet, examples, outcome, progress_console
 from modp_ti.files.errors import InputError
 
@@ -17,9 +17,16 @@ EXAMPLES = {
         "modp-ti crop out/room --around-cameras 3   (out/room-crop)",
         "modp-ti crop out/room --box -2,-1.5,0,2,1.5,4 --above -1.2 -o out/table",
     ),
+    "scale": examples(
+        "modp-ti scale out/room --from 12,80@40 --to 300,85@40 --metres 2.1",
+        "modp-ti scale out/room --marker tag36h11 --metres 0.16 --upright",
+    ),
 }
+# The same names as in modp_ti.outputs.locating.markers, whose imports take seconds.
+Family = Literal["tag16h5", "tag25h9", "tag36h10", "tag36h11", "aruco", "4x4", "5x5", "6x6", "7x7"]
 Output = Annotated[
-    Path | None, typer.Option("--output", "-o", metavar="PATH", help="the new folder; empty: OUT-clean or OUT-crop")
+    Path | None,
+    typer.Option("--output", "-o", metavar="PATH", help="the new folder; empty: OUT-clean, OUT-crop or OUT-scale"),
 ]
 
 
@@ -70,6 +77,52 @@ def crop(
         entry = crop_run(out, target, Region(*region))
         result.text = f"written to {target}; {entry['kept']} Gaussians kept, {entry['removed']} removed"
         result.data = {"output": str(target.absolute()), **entry}
+
+
+def scale(
+    out: Out,
+    output: Output = None,
+    start: Annotated[
+        str | None, typer.Option("--from", metavar="X,Y@FRAME", help="a pixel of a frame, as for `measure`")
+    ] = None,
+    end: Annotated[str | None, typer.Option("--to", metavar="X,Y@FRAME", help="another one")] = None,
+    marker: Annotated[
+        Family | None, typer.Option(help="family of markers that the frames show, instead of two pixels")
+    ] = None,
+    metres: Annotated[
+        float | None, typer.Option(min=1e-6, help="the length between the two points, or of a marker's black edge")
+    ] = None,
+    upright: Annotated[bool, typer.Option("--upright", help="turn the world so that y points down")] = False,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+) -> None:
+    """Give a finished map metres, by one length or by markers, or make it upright. OUT stays as it is."""
+    with outcome(as_json) as result:
+        by_points = start is not None and end is not None
+        if (start is None) != (end is None) or (by_points and marker is not None):
+            raise InputError("--from and --to go together, or instead of both --marker")
+        if (by_points or marker is not None) != (metres is not None) or (metres is None and not upright):
+            raise InputError("scale needs --metres with --from and --to or with --marker, or --upright")
+        from modp_ti.engine.edited_run import scale_run
+        from modp_ti.outputs.locating.markers import marker_scale
+        from modp_ti.outputs.measuring import length, point_at
+
+        target = _target(out, output, "scale")
+        factor, deviation, by = None, 0.0, ""
+        if metres is not None:
+            run, line = opened(out, quiet)
+            if marker is not None:
+                factor, deviation, count = marker_scale(run, marker, metres, line)
+                by = f"{count} marker{'s' if count > 1 else ''}"
+            else:
+                measured, spread = length([point_at(run, point) for point in (start or "", end or "")])
+                if measured <= spread:
+                    raise InputError(f"the points are {measured:.3g} \u00b1 {spread:.2g} apart: choose others")
+                factor, deviation, by = metres / measured, spread / measured, "one length"
+        scale_run(out, target, factor, deviation, by, upright)
+        what = f"; {factor:.6g} m per unit by {by}, \u00b1 {100 * deviation:.2g} %" if factor is not None else ""
+        result.text = f"written to {target}{what}"
+        result.data = {"output": str(target.absolute()), "factor": factor, "deviation": deviation, "by": by or None}
 
 
 def _target(out: Path, output: Path | None, suffix: str) -> Path:

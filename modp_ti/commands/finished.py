@@ -70,7 +70,7 @@ NOT_FOUND = 1
 Out = Annotated[Path, typer.Argument(metavar="OUT", help="output folder of a finished run")]
 
 
-def _opened(out: Path, quiet: bool) -> tuple[FinishedRun, ProgressLine]:
+def opened(out: Path, quiet: bool) -> tuple[FinishedRun, ProgressLine]:
     """Read a finished run, and return it with the line that shows the progress."""
     from modp_ti.outputs.playback.finished_run import open_run
     from modp_ti.outputs.progress import ProgressLine
@@ -137,7 +137,7 @@ def render(
     with outcome(as_json) as result:
         from modp_ti.outputs.playback.film import film, is_video, plan_flight
 
-        run, line = _opened(out, quiet)
+        run, line = opened(out, quiet)
         target = output or run.folder / f"{Path(path).stem}{'' if show == 'colour' else f'-{show}'}.mp4"
         if fps is not None and not is_video(target):
             raise InputError(f"--fps: is for videos, and {target} is a folder of pictures: leave it out")
@@ -193,7 +193,7 @@ def export(
 
         options = ExportOptions(voxel, texture, device, spz_version, height)
         options.require_used(format)
-        run, line = _opened(out, quiet)
+        run, line = opened(out, quiet)
         target = export_map(run, format, output, options, line)
         result.text = f"written to {target}"
         result.data = {"output": str(target.absolute()), "format": format}
@@ -246,23 +246,23 @@ def measure(
     a pixel.
     """
     with outcome(as_json) as result:
-        from modp_ti.outputs.measuring import area, described, length, point_at
+        from modp_ti.outputs.measuring import Ruler, point_at
 
-        run, _ = _opened(out, quiet)
+        run, _ = opened(out, quiet)
         found = [point_at(run, point) for point in points]
-        spans = {"length": length(found)} if len(found) > 1 else {}
-        spans |= {"area": area(found)} if len(found) > 2 else {}
+        ruler = Ruler.of(run)
         coordinates = (" ".join(f"{x:.6g}" for x in point.xyz + run.record.origin) for point in found)
         lines = [
             f"{name}: {at} \u00b1 {p.deviation:.2g}" for name, at, p in zip(points, coordinates, found, strict=True)
         ]
-        result.text = "\n".join([*lines, described(found)]).strip()
+        result.text = "\n".join([*lines, ruler.text(found)]).strip()
         result.data = {
             "points": [
                 {"xyz": (point.xyz + run.record.origin).tolist(), "covariance": point.covariance.tolist()}
                 for point in found
             ],
-            **{name: {"value": value, "deviation": spread} for name, (value, spread) in spans.items()},
+            "unit": ruler.unit,
+            **{name: {"value": value, "deviation": spread} for name, (value, spread) in ruler.spans(found).items()},
         }
 
 

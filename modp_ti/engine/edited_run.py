@@ -1,10 +1,11 @@
-"""`clean_run` and `crop_run`: a new output folder with some of the Gaussians of a finished run."""
+"""`clean_run`, `crop_run` and `scale_run`: a new output folder with a part of a finished map, or in other units."""
 
 from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
+from fields.frames.origin import shifted_poses
 from fields.geometry.se3 import camera_centres
 from fields.runtime.backend import initialise
 from modp_ti.config.scene_file import dump_scene
@@ -24,13 +26,18 @@ from modp_ti.files.errors import InputError
 from modp_ti.files.run_folder import appearing, is_run_folder
 from modp_ti.outputs.evaluation import keyframe_psnr, score_frame
 from modp_ti.outputs.formats.splats_ply import check_splats, write_splats
+from modp_ti.outputs.formats.trajectory import write_trajectory
+from modp_ti.outputs.measuring import WORLD
 from modp_ti.outputs.playback.finished_run import FinishedRun, open_run
 from modp_ti.outputs.playback.run_frames import frames_of, run_settings
 from modp_ti.outputs.progress import ProgressLine
+from modp_ti.outputs.splat_page.page import level, moved
 from pipelines.whole.cleaning import faults, harmless
 
 # What the new folder takes over as it is. Scores, pictures and report are of the whole map.
-COPIED = ("trajectory.txt", "frames.json", "exposure.json", "scores.csv", "recording.yaml", "colmap", "masks")
+COPIED = ("trajectory.txt", "frames.json", "exposure.json", "scores.csv", "recording.yaml", "colmap", "masks", WORLD)
+# Entries of metrics.json that mark folders of this file, which another call may replace.
+EDITS = ("cleaned", "cropped", "scaled")
 # Loss of held-out quality that removing faults may cost [dB].
 LOSS = 0.05
 # Frames that it is measured on, evenly spaced.
@@ -93,7 +100,8 @@ def crop_run(folder: Path, output: Path, region: Region) -> dict[str, Any]:
     poses[:, :3, 3] -= poses[:, :3, :3] @ origin
     kept = region.contains(run.gaussians["position"].astype(np.float64) + origin, poses)
     entry = {"kept": int(kept.sum()), "removed": int((~kept).sum())}
-    _write(run, kept, output, {"cropped": entry})
+    with _written(run, _those(run, kept), output, {"cropped": entry}):
+        pass
     return entry
 
 
@@ -143,35 +151,96 @@ def clean_run(folder: Path, output: Path, console: Console | None = None) -> dic
         "before": round(before, 4),
         "after": round(after, 4),
     }
-    _write(run, kept, output, {"cleaned": entry})
+    with _written(run, _those(run, kept), output, {"cleaned": entry}):
+        pass
     return entry
 
 
-def _write(run: FinishedRun, kept: NDArray[np.bool_], output: Path, entry: dict[str, Any]) -> None:
-    """Write a folder as the run's with the Gaussians that are kept (N,), and an entry of what was done in metrics.json.
+def scale_run(folder: Path, output: Path, metres: float | None, deviation: float, by: str, upright: bool) -> None:
+    """Write a new output folder with the map of a finished run in metres, or upright, or both.
+
+    Splats, poses, points and all lengths are changed; what is relative to them, such as scores, stays.
+
+    Args:
+        folder: Output folder of the run.
+        output: The new folder.
+        metres: Metres per scene unit; None to keep the units.
+        deviation: Relative standard deviation of it.
+        by: What it was measured by.
+        upright: Turn the world so that y points down, as far as the cameras were held without roll.
 
     Raises:
-        InputError: If nothing is kept, or the folder cannot be written.
+        InputError: If there is no finished run, or the folder cannot be written.
     """
-    output = output.expanduser().absolute()
+    from modp_ti.files.quiet_pycolmap import pycolmap
+
+    run = open_run(folder)
+    R = level(run.poses, run.record.scene_depth).R if upright else np.eye(3)
+    s = 1.0 if metres is None else metres
+    origin = s * R @ run.record.origin
+    poses = run.poses.copy()
+    poses[:, :3, :3], poses[:, :3, 3] = poses[:, :3, :3] @ R.T, s * poses[:, :3, 3]
+    gaussians = {name: values.astype(np.float32) for name, values in moved(run.gaussians, R, s).items()}
+    world = _world(run.folder)
+    if metres is not None:
+        world |= {"unit": "m", "deviation": deviation, "by": by}
+    if upright:
+        world |= {"down": [0.0, 1.0, 0.0]}
+    record = read_json(run.folder / "frames.json", "of a finished run")
+    record |= {"near": s * record["near"], "scene_depth": s * record["scene_depth"], "origin": origin.tolist()}
+    with _written(run, gaussians, output, {"scaled": {"factor": s, **world}}, origin) as new:
+        write_trajectory(new / "trajectory.txt", run.timestamps, list(shifted_poses(poses, origin)))
+        model = pycolmap.Reconstruction(str(new / "colmap"))
+        model.transform(pycolmap.Sim3d(np.column_stack([s * R, np.zeros(3)])))
+        model.write_binary(str(new / "colmap"))
+        replace_text(new / "frames.json", json.dumps(record, indent=1) + "\n")
+        replace_text(new / WORLD, json.dumps(world, indent=2) + "\n")
+
+
+def _world(folder: Path) -> dict[str, Any]:
+    path = folder / WORLD
+    return read_json(path, "of a finished run") if path.is_file() else {}
+
+
+def _those(run: FinishedRun, kept: NDArray[np.bool_]) -> dict[str, NDArray[np.float32]]:
+    """Return the Gaussians that are kept (N,). Raises InputError if there are none."""
     if not kept.any():
         raise InputError(f"{run.folder}: none of its {len(kept)} Gaussians would be left")
+    return {name: values[kept] for name, values in run.gaussians.items()}
+
+
+@contextmanager
+def _written(
+    run: FinishedRun,
+    gaussians: dict[str, NDArray[np.float32]],
+    output: Path,
+    entry: dict[str, Any],
+    origin: NDArray[np.float64] | None = None,
+) -> Iterator[Path]:
+    """Write a folder as the run's with other Gaussians, and an entry of what was done in metrics.json.
+
+    The caller may change the files of the folder that is handed out, before it appears.
+
+    Raises:
+        InputError: If the folder cannot be written.
+    """
+    output, origin = output.expanduser().absolute(), run.record.origin if origin is None else origin
     metrics = read_json(run.folder / "metrics.json", "of a finished run")
     if is_run_folder(output):
         there = read_json(output / "metrics.json", "of a finished run")
-        if output.resolve() == run.folder.resolve() or not {"cleaned", "cropped"} & there.keys():
+        if output.resolve() == run.folder.resolve() or not {*EDITS} & there.keys():
             raise InputError(f"{output}: holds the map of a run, which stays as it is: name another folder (-o)")
-    gaussians = {name: values[kept] for name, values in run.gaussians.items()}
     config = run_settings(run).model_copy(update={"output": output})
-    with appearing(output, OUTDATED) as folder:
+    with appearing(output, (*OUTDATED, WORLD)) as folder:
         for name in COPIED:
             source = run.folder / name
             if source.is_dir():
                 shutil.copytree(source, folder / name)
             elif source.is_file():
                 shutil.copy(source, folder / name)
-        write_splats(folder / "splats.ply", gaussians, run.record.origin)
-        check_splats(folder / "splats.ply", gaussians, run.record.origin)
+        write_splats(folder / "splats.ply", gaussians, origin)
+        check_splats(folder / "splats.ply", gaussians, origin)
         dump_scene(config, folder / "config.yaml")
-        metrics |= {"gaussians": int(kept.sum()), **entry}
+        metrics |= {"gaussians": len(gaussians["position"]), **entry}
         replace_text(folder / "metrics.json", json.dumps(metrics, indent=2) + "\n")
+        yield folder

@@ -10,10 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.geometry.se3 import inverse_se3, matrices_from_unit_quaternions
+from modp_ti.files import read_json
 from modp_ti.files.errors import InputError
 from modp_ti.outputs.playback.finished_run import FinishedRun
 from pipelines.render.formulas import ALPHA_MIN, BLUR
 
+# The file of an output folder that says in what units and axes its world is.
+WORLD = "world.json"
 # Opacity along a ray from which on there is a surface.
 SOLID = 0.5
 # Standard deviations of a Gaussian around its mean in which a ray meets it.
@@ -143,11 +146,45 @@ def _deviation(slopes: NDArray[np.float64], points: Sequence[SurfacePoint]) -> f
     return float(np.sqrt(sum(g @ point.covariance @ g for g, point in zip(slopes, points, strict=True))))
 
 
-def described(points: Sequence[SurfacePoint]) -> str:
-    """Return length and area of what the points span, in words; empty for fewer than two points."""
-    if len(points) < 2:
-        return ""
-    parts = [("length", length(points), "")] + ([("area", area(points), "\u00b2")] if len(points) > 2 else [])
-    return ", ".join(
-        f"{name} {value:.4g} \u00b1 {spread:.2g} scene units{power}" for name, (value, spread), power in parts
-    )
+@dataclass(frozen=True)
+class Ruler:
+    """Finds points of a map, and says what they span.
+
+    Attributes:
+        gaussians: Arrays by name, as from `GaussianField.to_numpy`.
+        unit: Name of the map's unit.
+        deviation: Relative standard deviation of the map's scale.
+    """
+
+    gaussians: Mapping[str, NDArray]
+    unit: str = "scene units"
+    deviation: float = 0.0
+
+    @classmethod
+    def of(cls, run: FinishedRun) -> Ruler:
+        """Return the ruler of a finished run, in metres where it has been scaled (`modp-ti scale`)."""
+        path = run.folder / WORLD
+        world = read_json(path, "of a finished run") if path.is_file() else {}
+        return cls(run.gaussians, world.get("unit", cls.unit), world.get("deviation", 0.0))
+
+    def point(self, origin: NDArray[np.float64], ray: NDArray[np.float64], pixel: float) -> SurfacePoint | None:
+        """See `surface_point`."""
+        return surface_point(self.gaussians, origin, ray, pixel)
+
+    def spans(self, points: Sequence[SurfacePoint]) -> dict[str, tuple[float, float]]:
+        """Return the length of two points or more, and the area of three or more, each with its deviation."""
+        found = {"length": length(points)} if len(points) > 1 else {}
+        found |= {"area": area(points)} if len(points) > 2 else {}
+        # An area's relative deviation is twice that of the scale.
+        return {
+            name: (value, float(np.hypot(spread, (1 + (name == "area")) * self.deviation * value)))
+            for name, (value, spread) in found.items()
+        }
+
+    def text(self, points: Sequence[SurfacePoint]) -> str:
+        """Return `spans` in words; empty for fewer than two points."""
+        squared = {"length": "", "area": "\u00b2"}
+        return ", ".join(
+            f"{name} {value:.4g} \u00b1 {spread:.2g} {self.unit}{squared[name]}"
+            for name, (value, spread) in self.spans(points).items()
+        )

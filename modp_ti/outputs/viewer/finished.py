@@ -14,7 +14,7 @@ from fields.geometry.se3 import inverse_se3
 from modp_ti.config.settings import ViewSettings
 from modp_ti.inputs.colmap_model import read_colmap_model
 from modp_ti.outputs.formats.run_files import read_exposures
-from modp_ti.outputs.measuring import surface_point
+from modp_ti.outputs.measuring import Ruler
 from modp_ti.outputs.playback.finished_run import FinishedRun
 from modp_ti.outputs.playback.map_renderer import MapRenderer, eight_bits, start_device
 from modp_ti.outputs.playback.run_frames import kept_images, pictures
@@ -54,8 +54,7 @@ class FinishedViewer:
         self._kept = kept_images(run) is not None
         self._exposures = read_exposures(run.folder / "exposure.json") if self._kept else {}
         modes = MODES if self._kept else tuple(mode for mode in MODES if mode != "error")
-        pick = partial(surface_point, gaussians)
-        self.page = Page(settings.host, settings.port, None, modes, self.choose, len(run), pick)
+        self.page = Page(settings.host, settings.port, None, modes, self.choose, len(run), Ruler.of(run))
         self.url = self.page.url
         start_device(device)
         largest = (max(*(getattr(c, side) for c in run.cameras), 0) for side in ("width", "height"))

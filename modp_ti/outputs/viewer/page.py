@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import camera_centres, inverse_se3, quaternion_from_matrix
 from modp_ti.files.errors import InputError
+from modp_ti.outputs.measuring import Ruler
 from modp_ti.outputs.viewer.handover import BrowserCamera, Gate, Requests
 from modp_ti.outputs.viewer.modes import MODES, SPLATS, Splats, frustum_lines, scale_of
-from modp_ti.outputs.viewer.tape import Pick, Tape
+from modp_ti.outputs.viewer.tape import Tape
 
 if TYPE_CHECKING:
     import viser
@@ -54,14 +55,14 @@ class Browser:
         client: viser's handle of the browser.
         modes: Display modes to choose from. The first one is shown first.
         frames: Number of frames to choose from; 0 for no choice.
-        pick: Finds the points between which it measures, or None.
+        ruler: Measures between the browser's clicks, or None.
 
     Attributes:
         nodes: The nodes of this browser alone, by name.
         chosen: The frame that this browser has chosen; None while it shows that of all browsers.
     """
 
-    def __init__(self, client: viser.ClientHandle, modes: Sequence[str], frames: int, pick: Pick | None) -> None:
+    def __init__(self, client: viser.ClientHandle, modes: Sequence[str], frames: int, ruler: Ruler | None) -> None:
         gui = client.gui
         self.client = client
         self.slider = gui.add_slider("Frame", 0, max(frames - 1, 1), 1, 0) if frames else None
@@ -69,7 +70,7 @@ class Browser:
         self._scale = gui.add_html("", visible=False)
         self._note = gui.add_markdown("")
         self.boxes = {name: gui.add_checkbox(label, initial_value=True) for name, label in LABELS.items()}
-        self.tape = Tape(client, pick, self.note) if pick is not None else None
+        self.tape = Tape(client, ruler, self.note) if ruler is not None else None
         self.look = gui.add_button("Look from the current frame")
         self.link = gui.add_button("Link to this view")
         self.nodes: dict[str, Any] = {}
@@ -134,7 +135,7 @@ class Page:
         modes: Display modes to choose from. The first one is shown first.
         choose: Called with a browser's id and the frame's position that it chooses, None for a page without slider.
         frames: Number of frames of the slider.
-        pick: Finds the points between which browsers measure, None for a page without measuring.
+        ruler: Measures between the clicks of browsers, None for a page without measuring.
 
     Attributes:
         requests: The pictures that browsers need.
@@ -153,7 +154,7 @@ class Page:
         modes: Sequence[str] = MODES,
         choose: Callable[[int, int], None] | None = None,
         frames: int = 0,
-        pick: Pick | None = None,
+        ruler: Ruler | None = None,
     ) -> None:
         try:
             import viser  # noqa: F401
@@ -166,7 +167,7 @@ class Page:
             ) from None
         self.requests = Requests()
         self._gate = gate
-        self._modes, self._choose, self._frames, self._pick = modes, choose, frames, pick
+        self._modes, self._choose, self._frames, self._ruler = modes, choose, frames, ruler
         self._units: float | None = None
         self._frame: ShownFrame | None = None  # of the browsers that have chosen none
         self._nodes: dict[str, Any] = {}  # those of all browsers
@@ -175,7 +176,7 @@ class Page:
         self._drawn = ""  # how many of the Gaussians all browsers draw
         self._lock = threading.RLock()  # nodes are changed by the publishing thread and by viser's threads
         before = set(threading.enumerate())
-        self._door = Door(host, port, TITLE, takes_clicks=pick is not None)
+        self._door = Door(host, port, TITLE, takes_clicks=ruler is not None)
         self._server = self._door.server
         self.threads = [thread for thread in threading.enumerate() if thread not in before]
         self.url = self._door.url
@@ -337,7 +338,7 @@ class Page:
 
     def _connected(self, client: viser.ClientHandle) -> None:
         number = client.client_id
-        browser = Browser(client, self._modes, self._frames if self._choose else 0, self._pick)
+        browser = Browser(client, self._modes, self._frames if self._choose else 0, self._ruler)
 
         def on(register: Callable[[Callable[[Any], None]], Any], act: Callable[[], None]) -> None:
             register(lambda _: self.attempt(number, act))

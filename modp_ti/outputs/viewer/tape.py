@@ -6,15 +6,12 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from modp_ti.outputs.measuring import SurfacePoint, described
+from modp_ti.outputs.measuring import Ruler, SurfacePoint
 
 if TYPE_CHECKING:
     import viser
 
-# Returns where a ray, an origin (3,) and a direction (3,) in scene units, meets the map; the last is a pixel's angle.
-Pick = Callable[[NDArray[np.float64], NDArray[np.float64], float], SurfacePoint | None]
 NODE, COLOUR = "/measured", (80, 255, 80)
 POINT_SIZE = 0.015  # [page units]
 
@@ -24,7 +21,7 @@ class Tape:
 
     Args:
         client: viser's handle of the browser.
-        pick: Finds the points.
+        ruler: Finds the points, and says what they span.
         note: Shows a text to the browser.
 
     Attributes:
@@ -32,10 +29,10 @@ class Tape:
         points: The points so far.
     """
 
-    def __init__(self, client: viser.ClientHandle, pick: Pick, note: Callable[[str], None]) -> None:
+    def __init__(self, client: viser.ClientHandle, ruler: Ruler, note: Callable[[str], None]) -> None:
         self.box = client.gui.add_checkbox("Measure", False, hint="click at two points or more")
         self.points: list[SurfacePoint] = []
-        self._client, self._pick, self._note = client, pick, note
+        self._client, self._ruler, self._note = client, ruler, note
 
     def set(self, units: float, attempt: Callable[[Callable[[], None]], None]) -> None:
         """Begin to measure or, if the box is not checked, end and forget the points.
@@ -56,7 +53,7 @@ class Tape:
     def _clicked(self, event: viser.SceneClickEvent, units: float) -> None:
         camera = self._client.camera
         pixel = camera.fov / max(camera.image_height, 1)
-        found = self._pick(np.array(event.ray_origin) / units, np.array(event.ray_direction), pixel)
+        found = self._ruler.point(np.array(event.ray_origin) / units, np.array(event.ray_direction), pixel)
         if found is None:
             self._note("there is no surface of the map")
             return
@@ -71,5 +68,5 @@ class Tape:
         if len(xyz) > 1:
             lines = np.stack([xyz[:-1], xyz[1:]], axis=1)
             scene.add_line_segments(f"{NODE}/lines", lines, COLOUR, thickness=2.0, thickness_units="screen")
-            scene.add_label(f"{NODE}/label", described(self.points[-2:]), position=xyz[-1])
-        self._note(described(self.points))
+            scene.add_label(f"{NODE}/label", self._ruler.text(self.points[-2:]), position=xyz[-1])
+        self._note(self._ruler.text(self.points))

@@ -31,7 +31,7 @@ from modp_ti.files.errors import InputError
 from tests.patience import PATIENCE
 
 PROJECT = Path(__file__).resolve().parents[3]
-COMMANDS = ["run", "batch", "refine", "clean", "crop", "cameras", "check"]
+COMMANDS = ["run", "batch", "refine", "clean", "crop", "scale", "cameras", "check"]
 COMMANDS += ["render", "export", "measure", "locate", "view", "warmup"]
 HEAVY = "('taichi', 'quadrants', 'torch', 'open3d', 'cv2', 'pycolmap')"
 

@@ -1,4 +1,4 @@
-"""`modp-ti clean` and `modp-ti crop` on the output folder of a small run of the room, with splats planted in it."""
+"""`modp-ti clean`, `crop` and `scale` on the output folder of a small run of the room, with splats planted in it."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ import shutil
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from fields.geometry.se3 import camera_centres
@@ -16,6 +18,8 @@ from modp_ti.commands.app import app
 from modp_ti.engine.edited_run import Region
 from modp_ti.outputs.formats.splats_ply import write_splats
 from modp_ti.outputs.playback.finished_run import open_run
+from modp_ti.outputs.playback.map_renderer import MapRenderer, start_device
+from modp_ti.outputs.splat_page.page import level
 from pipelines.whole.cleaning import harmless
 from tests.room import Room
 
@@ -48,6 +52,8 @@ def planted(finished: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     new = {name: values[pick] for name, values in state.items()}
     centre = np.resize(np.concatenate(places), (PLANTED, 3))
     new["position"] = (centre + rng.normal(0, 0.05, centre.shape)).astype(np.float32)
+    # As small as in pictures of a usual size: of 80x60, a splat of the map is a tenth when it is half as far.
+    new["log_scale"] = new["log_scale"] - np.float32(1.2)
     new["sh"] = rng.normal(0, 1.2, new["sh"].shape).astype(np.float32)
     new["sh"][:, 1:] = 0
     write_splats(out / "splats.ply", {name: np.concatenate([state[name], new[name]]) for name in state})
@@ -146,3 +152,52 @@ def test_less_is_taken_where_all_would_cost_too_much() -> None:
     np.testing.assert_array_equal(np.flatnonzero(taken["bad"]), np.arange(16, 24))  # the half that shows least
     assert (before, after) == (30.0, pytest.approx(30.0))
     assert not harmless({"bad": dear}, shows, lambda there: 0.0 if there.all() else -9.0, 0.05)[0]["bad"].any()
+
+
+def test_a_map_in_metres_and_upright_shows_the_same_pictures(finished: Path, tmp_path: Path) -> None:
+    before = files(finished)
+    points = ["20,20@4", "60,40@4"]
+    first = command("measure", finished, *points)["length"]["value"]
+    done = command(
+        "scale", finished, "--from", points[0], "--to", points[1], "--metres", 2.1, "--upright", "-o", tmp_path / "m"
+    )
+    assert done["code"] == 0 and done["factor"] == pytest.approx(2.1 / first)
+    again = command("measure", tmp_path / "m", *points)
+    assert again["unit"] == "m" and again["length"]["value"] == pytest.approx(2.1, rel=1e-4)
+    old, new = open_run(finished), open_run(tmp_path / "m")
+    a, b = camera_centres(old.poses), camera_centres(new.poses)
+    R, _ = Rotation.align_vectors(b - b.mean(axis=0), done["factor"] * (a - a.mean(axis=0)))
+    np.testing.assert_allclose(done["factor"] * a @ R.as_matrix().T, b, atol=1e-5)
+    assert R.apply([0.0, 0.0, 1.0]) @ [0.0, -1.0, 0.0] > np.cos(np.radians(15.0))  # z is up in the room
+    np.testing.assert_allclose(level(new.poses, 1.0).R, np.eye(3), atol=1e-5)
+    for name in ("near", "scene_depth"):
+        assert getattr(new.record, name) == pytest.approx(done["factor"] * getattr(old.record, name))
+    pictures = []
+    for run in (old, new):
+        start_device("cpu")
+        renderer = MapRenderer(run.gaussians, *run.size, run.record.near)
+        pictures.append(renderer.picture(run.cameras[4], run.poses[4]).astype(int))
+    assert np.abs(pictures[0] - pictures[1]).max() <= 2
+    models = [pycolmap.Reconstruction(str(run.folder / "colmap")) for run in (old, new)]
+    errors = [np.mean([point.error for point in model.points3D.values()]) for model in models]
+    for model in models:
+        model.update_point_3d_errors()
+    assert errors[1] == pytest.approx(errors[0])
+    np.testing.assert_allclose(
+        [models[1].points3D[i].xyz for i in models[1].points3D],
+        [done["factor"] * R.apply(models[0].points3D[i].xyz) for i in models[1].points3D],
+        atol=1e-5,
+    )
+    assert command("crop", tmp_path / "m", "--around-cameras", 9, "-o", tmp_path / "part")["code"] == 0
+    assert command("measure", tmp_path / "part", *points)["unit"] == "m"
+    assert files(finished) == before
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [(), ("--metres", 2), ("--from", "1,1@0", "--metres", 2), ("--marker", "tag36h11"), ("--upright", "--metres", 1)],
+)
+def test_a_scale_that_is_not_whole_is_refused(finished: Path, tmp_path: Path, wrong: tuple) -> None:
+    found = command("scale", finished, *wrong, "-o", tmp_path / "none")
+    assert found["code"] == 2 and found["error"]
+    assert not (tmp_path / "none").exists()

@@ -21,7 +21,7 @@ from zstandard import ZstdDecompressor
 
 from fields.geometry.camera import PinholeCamera
 from modp_ti.files.errors import InputError
-from modp_ti.outputs.measuring import SurfacePoint
+from modp_ti.outputs.measuring import Ruler, SurfacePoint
 from modp_ti.outputs.viewer.handover import Gate
 from modp_ti.outputs.viewer.modes import Splats
 from modp_ti.outputs.viewer.page import Page
@@ -31,9 +31,11 @@ CAMERA = PinholeCamera(100.0, 100.0, 60.0, 40.0, 120, 80)
 PROTOCOL = f"viser-v{viser.__version__}"
 
 
-def at_the_tip(origin: np.ndarray, ray: np.ndarray, pixel: float) -> SurfacePoint | None:
+class Tips(Ruler):
     """A surface where rays of length one end, and none behind."""
-    return SurfacePoint(origin + ray, np.zeros((3, 3))) if ray[2] > 0 else None
+
+    def point(self, origin: np.ndarray, ray: np.ndarray, pixel: float) -> SurfacePoint | None:
+        return SurfacePoint(origin + ray, np.zeros((3, 3))) if ray[2] > 0 else None
 
 
 @pytest.fixture
@@ -43,7 +45,7 @@ def gate() -> Gate:
 
 @pytest.fixture
 def page(gate: Gate) -> Iterator[Page]:
-    page = Page("127.0.0.1", 0, gate, choose=lambda client, frame: None, frames=5, pick=at_the_tip)
+    page = Page("127.0.0.1", 0, gate, choose=lambda client, frame: None, frames=5, ruler=Tips({}))
     yield page
     page.close()
 
