@@ -27,7 +27,7 @@ from modp_ti.files.run_folder import appearing, is_run_folder
 from modp_ti.outputs.evaluation import keyframe_psnr, score_frame
 from modp_ti.outputs.formats.splats_ply import check_splats, write_splats
 from modp_ti.outputs.formats.trajectory import write_trajectory
-from modp_ti.outputs.measuring import WORLD
+from modp_ti.outputs.measuring import WORLD, read_world
 from modp_ti.outputs.playback.finished_run import FinishedRun, open_run
 from modp_ti.outputs.playback.run_frames import frames_of, run_settings
 from modp_ti.outputs.progress import ProgressLine
@@ -181,7 +181,7 @@ def scale_run(folder: Path, output: Path, metres: float | None, deviation: float
     poses = run.poses.copy()
     poses[:, :3, :3], poses[:, :3, 3] = poses[:, :3, :3] @ R.T, s * poses[:, :3, 3]
     gaussians = {name: values.astype(np.float32) for name, values in moved(run.gaussians, R, s).items()}
-    world = _world(run.folder)
+    world = read_world(run.folder)
     if metres is not None:
         world |= {"unit": "m", "deviation": deviation, "by": by}
     if upright:
@@ -195,11 +195,6 @@ def scale_run(folder: Path, output: Path, metres: float | None, deviation: float
         model.write_binary(str(new / "colmap"))
         replace_text(new / "frames.json", json.dumps(record, indent=1) + "\n")
         replace_text(new / WORLD, json.dumps(world, indent=2) + "\n")
-
-
-def _world(folder: Path) -> dict[str, Any]:
-    path = folder / WORLD
-    return read_json(path, "of a finished run") if path.is_file() else {}
 
 
 def _those(run: FinishedRun, kept: NDArray[np.bool_]) -> dict[str, NDArray[np.float32]]:

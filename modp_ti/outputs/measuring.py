@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -146,6 +148,12 @@ def _deviation(slopes: NDArray[np.float64], points: Sequence[SurfacePoint]) -> f
     return float(np.sqrt(sum(g @ point.covariance @ g for g, point in zip(slopes, points, strict=True))))
 
 
+def read_world(folder: Path) -> dict[str, Any]:
+    """Return what an output folder says of the units and axes of its world; nothing if it was never scaled."""
+    path = folder / WORLD
+    return read_json(path, "of a finished run") if path.is_file() else {}
+
+
 @dataclass(frozen=True)
 class Ruler:
     """Finds points of a map, and says what they span.
@@ -163,8 +171,7 @@ class Ruler:
     @classmethod
     def of(cls, run: FinishedRun) -> Ruler:
         """Return the ruler of a finished run, in metres where it has been scaled (`modp-ti scale`)."""
-        path = run.folder / WORLD
-        world = read_json(path, "of a finished run") if path.is_file() else {}
+        world = read_world(run.folder)
         return cls(run.gaussians, world.get("unit", cls.unit), world.get("deviation", 0.0))
 
     def point(self, origin: NDArray[np.float64], ray: NDArray[np.float64], pixel: float) -> SurfacePoint | None:

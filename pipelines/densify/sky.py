@@ -43,7 +43,7 @@ def sky_pixels(view: Keyframe, opacity: NDArray[np.floating]) -> NDArray[np.floa
     pointed = cv2.dilate(pointed, np.ones((2 * AWAY + 1, 2 * AWAY + 1), dtype=np.uint8))
     sky = np.isin(region, at_the_top[at_the_top > 0]) & (pointed == 0) & (opacity < HOLE)
     height, width = sky.shape
-    spacing = max(width, height) // ACROSS + 1
+    spacing = _spacing(view)
     y, x = np.mgrid[spacing // 2 : height : spacing, spacing // 2 : width : spacing].reshape(2, -1)
     chosen = sky[y, x]
     return np.stack([x[chosen] + 0.5, y[chosen] + 0.5], axis=1)
@@ -56,4 +56,9 @@ def sky_seeds(view: Keyframe, pixels: NDArray[np.float64], estimate: DepthEstima
     """
     depth = np.where(estimate.deviation < UNKNOWN, estimate.depth, FAR * view.median_depth)
     seeds = seeds_at(view, pixels, depth)
-    return Seeds(seeds.xyz, seeds.size * (max(view.rgba.shape[:2]) // ACROSS + 1), seeds.colour)
+    return Seeds(seeds.xyz, seeds.size * _spacing(view), seeds.colour)
+
+
+def _spacing(view: Keyframe) -> int:
+    """Distance between the pixels of `sky_pixels` [px]."""
+    return max(view.rgba.shape[:2]) // ACROSS + 1
