@@ -72,6 +72,11 @@ class PinholeCamera:
         sx, sy = width / self.width, height / self.height
         return PinholeCamera(self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy, width, height)
 
+    def within(self, longest: int) -> PinholeCamera:
+        """Return the camera for the same view with at most `longest` pixels on a side."""
+        s = min(1.0, longest / max(self.width, self.height))
+        return self.resized(max(round(s * self.width), 1), max(round(s * self.height), 1))
+
     def project(self, points_camera: NDArray[np.floating]) -> NDArray[np.float64]:
         """Project points (N, 3) in the camera frame, with z > 0, to pixels (N, 2) as (x, y)."""
         p = np.asarray(points_camera, dtype=np.float64)

@@ -58,7 +58,7 @@ def crop(
     ] = None,
     above: Annotated[
         float | None,
-        typer.Option(metavar="H", help="at least so high over the middle of the cameras, along their mean up"),
+        typer.Option(metavar="H", help="at least so high over the middle of the cameras, along the world's up"),
     ] = None,
     quiet: Quiet = False,
     as_json: AsJson = False,
@@ -92,7 +92,9 @@ def scale(
     metres: Annotated[
         float | None, typer.Option(min=1e-6, help="the length between the two points, or of a marker's black edge")
     ] = None,
-    upright: Annotated[bool, typer.Option("--upright", help="turn the world so that y points down")] = False,
+    upright: Annotated[
+        bool, typer.Option("--upright", help="turn the world so that y points down, by the map's vertical edges")
+    ] = False,
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> None:
@@ -103,14 +105,18 @@ def scale(
             raise InputError("--from and --to go together, or instead of both --marker")
         if (by_points or marker is not None) != (metres is not None) or (metres is None and not upright):
             raise InputError("scale needs --metres with --from and --to or with --marker, or --upright")
+        import numpy as np
+
         from modp_ti.engine.edited_run import scale_run
         from modp_ti.outputs.locating.markers import marker_scale
+        from modp_ti.outputs.locating.vertical import vertical
         from modp_ti.outputs.measuring import length, point_at
+        from modp_ti.outputs.splat_page.page import Y, levelled, turning
 
         target = _target(out, output, "scale")
-        factor, deviation, by = None, 0.0, ""
+        run, line = opened(out, quiet)
+        factor, R, about, said = 1.0, np.eye(3), {}, [f"written to {target}"]
         if metres is not None:
-            run, line = opened(out, quiet)
             if marker is not None:
                 factor, deviation, count = marker_scale(run, marker, metres, line)
                 by = f"{count} marker{'s' if count > 1 else ''}"
@@ -119,10 +125,22 @@ def scale(
                 if measured <= spread:
                     raise InputError(f"the points are {measured:.3g} \u00b1 {spread:.2g} apart: choose others")
                 factor, deviation, by = metres / measured, spread / measured, "one length"
-        scale_run(out, target, factor, deviation, by, upright)
-        what = f"; {factor:.6g} m per unit by {by}, \u00b1 {100 * deviation:.2g} %" if factor is not None else ""
-        result.text = f"written to {target}{what}"
-        result.data = {"output": str(target.absolute()), "factor": factor, "deviation": deviation, "by": by or None}
+            about |= {"unit": "m", "deviation": deviation, "by": by}
+            said.append(f"{factor:.6g} m per unit by {by}, \u00b1 {100 * deviation:.2g} %")
+        if upright:
+            found = vertical(run, line)
+            down, tilt = found or (levelled(run).R[1], None)
+            R = turning(down, Y)
+            about |= {"down": Y.tolist(), "down_deviation": None if tilt is None else float(np.degrees(tilt))}
+            sure = (
+                "by the cameras alone, not sure"
+                if tilt is None
+                else f"by vertical edges, \u00b1 {np.degrees(tilt):.1g}"
+            )
+            said.append(f"turned by {np.degrees(np.arccos(min(down[1], 1))):.3g} degrees {sure}")
+        scale_run(out, target, factor, R, about)
+        result.text = "; ".join(said)
+        result.data = {"output": str(target.absolute()), "factor": factor, **about}
 
 
 def _target(out: Path, output: Path | None, suffix: str) -> Path:

@@ -31,7 +31,7 @@ from modp_ti.outputs.measuring import WORLD, read_world
 from modp_ti.outputs.playback.finished_run import FinishedRun, open_run
 from modp_ti.outputs.playback.run_frames import frames_of, run_settings
 from modp_ti.outputs.progress import ProgressLine
-from modp_ti.outputs.splat_page.page import level, moved
+from modp_ti.outputs.splat_page.page import levelled, moved
 from pipelines.whole.cleaning import faults, harmless
 
 # What the new folder takes over as it is. Scores, pictures and report are of the whole map.
@@ -52,7 +52,7 @@ class Region:
         box: Two opposite corners (6,).
         sphere: Centre and radius (4,).
         around_cameras: Largest distance from the nearest camera.
-        above: Least height over the middle of the cameras, along their mean up.
+        above: Least height over the middle of the cameras.
     """
 
     box: Sequence[float] | None = None
@@ -60,10 +60,11 @@ class Region:
     around_cameras: float | None = None
     above: float | None = None
 
-    def contains(self, xyz: NDArray[np.float64], poses: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return whether points (N, 3) lie in the region, given all T_camera_world (F, 4, 4)."""
+    def contains(
+        self, xyz: NDArray[np.float64], centres: NDArray[np.float64], down: NDArray[np.float64]
+    ) -> NDArray[np.bool_]:
+        """Return whether points (N, 3) lie in the region, given the cameras' centres (F, 3) and down (3,)."""
         inside = np.ones(len(xyz), dtype=bool)
-        centres = camera_centres(poses)
         if self.box is not None:
             low, high = np.sort(np.reshape(self.box, (2, 3)), axis=0)
             inside &= ((xyz >= low) & (xyz <= high)).all(axis=1)
@@ -75,8 +76,7 @@ class Region:
                 np.minimum(near, np.linalg.norm(xyz - centre, axis=1), out=near)
             inside &= near <= self.around_cameras
         if self.above is not None:
-            up = -poses[:, 1, :3].mean(axis=0)
-            inside &= (xyz - np.median(centres, axis=0)) @ (up / np.linalg.norm(up)) >= self.above
+            inside &= (np.median(centres, axis=0) - xyz) @ down >= self.above
         return inside
 
 
@@ -96,9 +96,8 @@ def crop_run(folder: Path, output: Path, region: Region) -> dict[str, Any]:
     """
     run = open_run(folder)
     origin = run.record.origin
-    poses = run.poses.copy()
-    poses[:, :3, 3] -= poses[:, :3, :3] @ origin
-    kept = region.contains(run.gaussians["position"].astype(np.float64) + origin, poses)
+    centres = camera_centres(run.poses) + origin
+    kept = region.contains(run.gaussians["position"].astype(np.float64) + origin, centres, levelled(run).R[1])
     entry = {"kept": int(kept.sum()), "removed": int((~kept).sum())}
     with _written(run, _those(run, kept), output, {"cropped": entry}):
         pass
@@ -156,18 +155,25 @@ def clean_run(folder: Path, output: Path, console: Console | None = None) -> dic
     return entry
 
 
-def scale_run(folder: Path, output: Path, metres: float | None, deviation: float, by: str, upright: bool) -> None:
-    """Write a new output folder with the map of a finished run in metres, or upright, or both.
+def scale_run(
+    folder: Path,
+    output: Path,
+    s: float,
+    R: NDArray[np.float64],
+    about: dict[str, Any],
+    t: NDArray[np.float64] | None = None,
+) -> None:
+    """Write a new output folder with the map of a finished run moved to a point's place s R x + t.
 
     Splats, poses, points and all lengths are changed; what is relative to them, such as scores, stays.
 
     Args:
         folder: Output folder of the run.
         output: The new folder.
-        metres: Metres per scene unit; None to keep the units.
-        deviation: Relative standard deviation of it.
-        by: What it was measured by.
-        upright: Turn the world so that y points down, as far as the cameras were held without roll.
+        s: Factor on lengths.
+        R: Rotation (3, 3).
+        about: What `world.json` says of the new units and axes.
+        t: Translation (3,); None for zero.
 
     Raises:
         InputError: If there is no finished run, or the folder cannot be written.
@@ -175,23 +181,18 @@ def scale_run(folder: Path, output: Path, metres: float | None, deviation: float
     from modp_ti.files.quiet_pycolmap import pycolmap
 
     run = open_run(folder)
-    R = level(run.poses, run.record.scene_depth).R if upright else np.eye(3)
-    s = 1.0 if metres is None else metres
-    origin = s * R @ run.record.origin
+    t = np.zeros(3) if t is None else t
+    origin = s * R @ run.record.origin + t
     poses = run.poses.copy()
     poses[:, :3, :3], poses[:, :3, 3] = poses[:, :3, :3] @ R.T, s * poses[:, :3, 3]
     gaussians = {name: values.astype(np.float32) for name, values in moved(run.gaussians, R, s).items()}
-    world = read_world(run.folder)
-    if metres is not None:
-        world |= {"unit": "m", "deviation": deviation, "by": by}
-    if upright:
-        world |= {"down": [0.0, 1.0, 0.0]}
+    world = read_world(run.folder) | about
     record = read_json(run.folder / "frames.json", "of a finished run")
     record |= {"near": s * record["near"], "scene_depth": s * record["scene_depth"], "origin": origin.tolist()}
     with _written(run, gaussians, output, {"scaled": {"factor": s, **world}}, origin) as new:
         write_trajectory(new / "trajectory.txt", run.timestamps, list(shifted_poses(poses, origin)))
         model = pycolmap.Reconstruction(str(new / "colmap"))
-        model.transform(pycolmap.Sim3d(np.column_stack([s * R, np.zeros(3)])))
+        model.transform(pycolmap.Sim3d(np.column_stack([s * R, t])))
         model.write_binary(str(new / "colmap"))
         replace_text(new / "frames.json", json.dumps(record, indent=1) + "\n")
         replace_text(new / WORLD, json.dumps(world, indent=2) + "\n")

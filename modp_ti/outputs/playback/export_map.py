@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.frames.origin import shifted_poses
-from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import camera_centres
 from modp_ti.files.errors import InputError
 from modp_ti.files.run_folder import list_files, refuse_foreign
@@ -41,7 +40,7 @@ from modp_ti.outputs.playback.plain_colours import with_plain_colours
 from modp_ti.outputs.playback.run_frames import kept_images, pictures
 from modp_ti.outputs.progress import ProgressLine
 from modp_ti.outputs.report.page import show_link_to_map
-from modp_ti.outputs.splat_page.page import level, moved, viewer_settings, write_splat_page
+from modp_ti.outputs.splat_page.page import levelled, moved, viewer_settings, write_splat_page
 from pipelines.surface.depth import DepthMatcher, DepthView, joined_depth
 from pipelines.surface.free_space import carved, reached
 from pipelines.whole.hierarchy import Hierarchy
@@ -174,7 +173,7 @@ def _spz(run: FinishedRun, target: Path, options: ExportOptions, line: ProgressL
 def _page(run: FinishedRun, target: Path, options: ExportOptions, line: ProgressLine) -> None:
     """Write the page, and show the link to it in the run's report if it lies next to it under its default name."""
     with line.working("writing the page"):
-        upright = level(run.poses, run.record.scene_depth)
+        upright = levelled(run)
         state = moved(run.gaussians, upright.R, upright.scale)
         write_splat_page(target, run.folder.absolute().name, viewer_settings(run, upright), state)
         if target.resolve() == (run.folder / PAGE).resolve():
@@ -184,7 +183,7 @@ def _page(run: FinishedRun, target: Path, options: ExportOptions, line: Progress
 def _levels_of_detail(run: FinishedRun, target: Path, options: ExportOptions, line: ProgressLine) -> None:
     """Write the map at all levels of detail, upright as in the page, with a page that streams it."""
     with line.working("writing levels of detail"):
-        upright = level(run.poses, run.record.scene_depth)
+        upright = levelled(run)
         hierarchy = Hierarchy(moved(run.gaussians, upright.R, upright.scale))
         with new_folder(target) as folder:
             write_sog_lod(folder, hierarchy)
@@ -234,7 +233,7 @@ def _mesh(run: FinishedRun, target: Path, options: ExportOptions, line: Progress
     if options.texture:
         with line.working("unwrapping the surface"):
             flat = unwrapped(mesh)
-        places = [(_within(run.cameras[index], longest), run.poses[index]) for index in run.spread(PAINTED_VIEWS)]
+        places = [(run.cameras[index].within(longest), run.poses[index]) for index in run.spread(PAINTED_VIEWS)]
         shots = ((*place, renderer.view(*place).colour) for place in line.through("painting", places, len(places)))
         write_textured_mesh(target, painted(flat, shots))
         return
@@ -248,7 +247,7 @@ def _collision(run: FinishedRun, target: Path, options: ExportOptions, line: Pro
     depth = run.record.scene_depth
     with new_folder(target) as folder:
         views = _surface_views(run, _loaded(run, LONGEST_SIDE, options.device, line), line)
-        R = level(run.poses, depth).R
+        R = levelled(run).R
         R_grid_world = np.stack([R[0], R[2], -R[1]])
         places = camera_centres(run.poses)
         way = places[run.way]
@@ -275,7 +274,7 @@ def _collision(run: FinishedRun, target: Path, options: ExportOptions, line: Pro
 
 def _loaded(run: FinishedRun, longest: int, device: str, line: ProgressLine) -> MapRenderer:
     """Load the map for pictures of its frames with at most `longest` pixels on a side."""
-    cameras = [_within(run.cameras[index], longest) for index in run.mapped]
+    cameras = [run.cameras[index].within(longest) for index in run.mapped]
     with line.working("loading the map"):
         gaussians = run.gaussians
         start_device(device)
@@ -299,7 +298,7 @@ def _surface_views(run: FinishedRun, renderer: MapRenderer, line: ProgressLine) 
         grey = []
         line.note(f"note: matching the map's own pictures, since the images cannot be read: {error}")
     shown, views = [], []
-    placed = [(_within(run.cameras[index], LONGEST_SIDE), run.poses[index]) for index in chosen]
+    placed = [(run.cameras[index].within(LONGEST_SIDE), run.poses[index]) for index in chosen]
     for number, (camera, T) in enumerate(line.through("rendering", placed, len(placed))):
         view = renderer.view(camera, T)
         shown.append(eight_bits(view.colour))
@@ -320,12 +319,6 @@ def _surface_views(run: FinishedRun, renderer: MapRenderer, line: ProgressLine) 
 
 def _grey(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
-
-
-def _within(camera: PinholeCamera, longest: int) -> PinholeCamera:
-    """Return the camera for the same view with at most `longest` pixels on a side."""
-    s = min(1.0, longest / max(camera.width, camera.height))
-    return camera.resized(max(round(s * camera.width), 1), max(round(s * camera.height), 1))
 
 
 FORMATS = {

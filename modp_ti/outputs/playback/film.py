@@ -27,7 +27,7 @@ from modp_ti.outputs.playback.finished_run import FinishedRun
 from modp_ti.outputs.playback.map_renderer import MapRenderer, eight_bits, start_device
 from modp_ti.outputs.playback.panoramas import PanoramaRenderer
 from modp_ti.outputs.progress import ProgressLine
-from modp_ti.outputs.splat_page.page import level
+from modp_ti.outputs.splat_page.page import levelled
 from pipelines.render.renderer import RenderedView
 
 Shown = Literal["colour", "depth", "normals"]
@@ -246,7 +246,7 @@ def plan_flight(
     if len(cameras) < len(poses):
         cameras *= len(poses)
     if panorama is not None and path in PATHS:
-        down = level(run.poses, run.record.scene_depth).R[1]
+        down = levelled(run).R[1]
         poses = np.stack([upright(T, down) for T in poses])
     return Flight(
         poses,

@@ -16,6 +16,7 @@ from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import camera_centres, exp_se3, quaternion_from_matrix
 from modp_ti.files.atomic import replace_text
 from modp_ti.outputs.formats.sog import sog_bytes
+from modp_ti.outputs.measuring import read_world
 from modp_ti.outputs.playback.camera_paths import smoothed
 from modp_ti.outputs.playback.finished_run import FinishedRun
 from pipelines.render.spherical_harmonics import sh_rotation
@@ -32,6 +33,7 @@ FRAME_RATE = 30
 # Decimals of positions [m].
 DIGITS = 4
 TO_VIEWER = np.array([-1.0, -1.0, 1.0])
+Y = np.array([0.0, 1.0, 0.0])
 # Fields of view that the viewer accepts [degrees].
 FIELDS_OF_VIEW = (10.0, 120.0)
 
@@ -66,7 +68,15 @@ def level(poses: NDArray[np.float64], scene_depth: float) -> Levelled:
     A = x.T @ x + HELD * (len(y) * np.eye(3) - y.T @ y)
     down = np.linalg.eigh(A)[1][:, 0]
     down = down if down @ y.sum(axis=0) >= 0 else -down
-    return Levelled(_turning(down, np.array([0.0, 1.0, 0.0])), DEPTH / scene_depth)
+    return Levelled(turning(down, Y), DEPTH / scene_depth)
+
+
+def levelled(run: FinishedRun) -> Levelled:
+    """Return what makes a finished map upright: its `world.json` (`modp-ti scale`), else its cameras, see `level`."""
+    down = read_world(run.folder).get("down")
+    if down is None:
+        return level(run.poses, run.record.scene_depth)
+    return Levelled(turning(np.array(down), Y), DEPTH / run.record.scene_depth)
 
 
 def moved(state: Mapping[str, NDArray], R: NDArray[np.float64], scale: float) -> dict[str, NDArray]:
@@ -135,7 +145,7 @@ def _longer_side(camera: PinholeCamera) -> float:
     return round(float(np.clip(np.degrees(2 * np.arctan(ratio / 2)), *FIELDS_OF_VIEW)), DIGITS)
 
 
-def _turning(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+def turning(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the smallest rotation (3, 3) that takes the unit vector a to the unit vector b."""
     axis = np.cross(a, b)
     sine, cosine = float(np.linalg.norm(axis)), float(a @ b)
