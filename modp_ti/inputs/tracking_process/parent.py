@@ -1,7 +1,7 @@
 """`TrackingProcess`: the tracker `klt` in a process of its own, and what is exchanged with it.
 
-Frames and corrections go through a pipe as they are, with the image pyramids that the other process has built; counts
-are in shared memory.
+Frames without their pictures and corrections go through a pipe; counts are in shared memory. Both processes read the
+images, each for itself.
 """
 
 from __future__ import annotations
@@ -12,15 +12,14 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing, suppress
-from copy import copy
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import cached_property
 from multiprocessing import Pipe
 from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
@@ -77,13 +76,6 @@ class CameraRevised:
 
 
 @dataclass(frozen=True)
-class Vignette:
-    """The vignette of the frames that follow, which come without it: one array for all frames of a camera."""
-
-    vignette: NDArray[np.float32] | None
-
-
-@dataclass(frozen=True)
 class Ended:
     """The stream has ended, by an error of the input or a failure of the tracker if one is given."""
 
@@ -91,13 +83,6 @@ class Ended:
     unreadable: Mapping[str, UnreadableImageError]
     error: InputError | None = None
     failure: str | None = None
-
-
-def with_vignette(frame: TrackedFrame, vignette: NDArray[np.float32] | None) -> TrackedFrame:
-    """Return a frame with another vignette, and with the pyramid that it has built."""
-    other = copy(frame)
-    vars(other)["vignette"] = vignette
-    return other
 
 
 class CountsBoard:
@@ -149,8 +134,8 @@ class CountsBoard:
 class TrackingProcess(Tracker):
     """The tracker `klt`, and the capture of its images, in a process of its own, so that mapping does not delay them.
 
-    It delivers what the tracker there delivers. Frames wait there until they are taken, without their images beyond the
-    first few. `pictures` reads images in this process, so the other one need not exist any more.
+    It delivers what the tracker there delivers. Frames wait there until they are taken, without their pictures, which
+    this process reads. `pictures` therefore needs the other one no more.
 
     Ctrl-C ends the recording, if this object is made in the main thread; a later one, or one after the end of the
     stream, goes to the handler that was there before. If the process dies, the recording ends too, with a note. The
@@ -168,7 +153,6 @@ class TrackingProcess(Tracker):
 
     def __init__(self, config: Scene, progress: Progress | None = None) -> None:
         self._config = config
-        self._vignette: NDArray[np.float32] | None = None
         self._taken = 0  # frames
         self._unreadable: Mapping[str, UnreadableImageError] = {}
         self._ended = False
@@ -248,11 +232,9 @@ class TrackingProcess(Tracker):
         self._wait_until_open()
         while not self._ended:
             message = self._receive()
-            if isinstance(message, Vignette):
-                self._vignette = message.vignette
-            elif isinstance(message, TrackedFrame):
+            if isinstance(message, dict):
                 self._taken += 1
-                yield with_vignette(message, self._vignette)
+                yield TrackedFrame(**message, **vars(self._reader.read(message["name"], self.undistorter)))
             elif isinstance(message, CameraRevised):
                 self._undistorter = message.intrinsics.undistorter(self._scale)
             elif isinstance(message, PoseCorrection):
@@ -261,12 +243,14 @@ class TrackingProcess(Tracker):
                 self._end(message)
 
     def pictures(self, names: Sequence[str]) -> Iterator[tuple[str, Picture]]:
-        if self._kept is None:
-            images = open_source(self._config.source.model_copy(update={"realtime": False}))
-        else:
-            images = StoredFrames(Path(self._kept.name), names)
-        with closing(images):
-            yield from pictures_again(FrameReader(images, self._config.source), ((n, self.undistorter) for n in names))
+        return pictures_again(self._reader, ((name, self.undistorter) for name in names))
+
+    @cached_property
+    def _reader(self) -> FrameReader:
+        """Reads the images in this process."""
+        if self._kept is not None:
+            return FrameReader(StoredFrames(Path(self._kept.name)), self._config.source)
+        return FrameReader(open_source(self._config.source.model_copy(update={"realtime": False})), self._config.source)
 
     def close(self) -> None:
         """End the recording and the process, and remove what was stored."""
@@ -280,6 +264,8 @@ class TrackingProcess(Tracker):
             self._process.wait()
         self._connection.close()  # last, as another thread may read from it until the process has ended
         self._interrupt.give_back()
+        if "_reader" in vars(self):
+            self._reader.images.close()
         if self._kept is not None:
             self._kept.cleanup()
 
