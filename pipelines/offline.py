@@ -200,8 +200,7 @@ class OfflineMapper(Pipeline):
         renderer = self.renderer
         renderer.forward(view.camera, view.T_camera_world, self.near, exact=False)
         renderer.develop(None, view.vignette)
-        renderer.images.set_reference(view.rgba)
-        values = self.loss.forward()
+        values = self.loss.forward(view.rgba)
         self.loss.send()
         self.loss.backward(self.settings.ssim_weight)
         renderer.backward(observe=self.density.statistics.observe)

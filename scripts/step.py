@@ -164,8 +164,7 @@ def measure_step(device: str, threads: int, size: Size, repeats: int) -> dict[st
     weights = settings.optimise
 
     def loss() -> None:
-        renderer.images.set_reference(view.rgba)
-        optimiser.loss.forward()
+        optimiser.loss.forward(view.rgba)
         optimiser.loss.backward(weights.ssim_weight)
 
     optimiser.compare(view, store.scene_depth)

@@ -32,6 +32,7 @@ class DevicePairs:
         emitted_slot: Per emitted pair, the slot of the projected Gaussian.
         gradient: Per emitted pair, ten sums over the tile's pixels. Those of a slot are contiguous from
             `projected.first_pair`.
+        tile: Per sorted pair, its tile.
         slot: Per sorted pair, the slot of the projected Gaussian.
         rows: Per sorted pair, the rows that its ellipse reaches, as in `TilePairs`.
         origin: Per sorted pair, its index in the emitted order.
@@ -71,8 +72,8 @@ class DevicePairs:
             torch.empty(n, dtype=torch.int32, device=self.device) for _ in range(3)
         )
         self.gradient = torch.empty(10 * n, dtype=torch.float32, device=self.device)
-        # A placeholder, which the first sort replaces.
-        self.origin = torch.empty(n, dtype=torch.int64, device=self.device)
+        # Placeholders, which the first sort replaces.
+        self.tile, self.origin = self.key, torch.empty(n, dtype=torch.int64, device=self.device)
 
     @property
     def count(self) -> int:

@@ -181,8 +181,13 @@ class ImageBuffers:
     def set_reference(self, image: np.ndarray) -> None:
         """Set the reference image: RGB and validity (H, W, 4) uint8, 255 at valid pixels and 0 at masked ones."""
         self.masked = self._references is None and not image[..., 3].all()
-        pixels = np.ascontiguousarray(image) if self._references is None else self._references.of(image)
+        pixels = np.ascontiguousarray(image) if self._references is None else self.on_device(image)
         self._take_reference(self.width * self.height, self.width, self.height, pixels)
+
+    def on_device(self, image: np.ndarray) -> torch.Tensor:
+        """Return a GPU's copy of a reference image, for kernels that call `take_pixel`."""
+        assert self._references is not None
+        return self._references.of(image)
 
     def set_gradients(self, *gradients: np.ndarray | torch.Tensor) -> None:
         """Set d loss / d image.
@@ -260,11 +265,15 @@ class ImageBuffers:
         """The same with one thread per pixel, for a GPU."""
         ti.loop_config(serialize=alone)
         for i in range(width * height):
-            x, y = i % width, i // width
-            at = (y + PAD) * self.stride + PAD + x
-            for c in ti.static(range(3)):
-                self.reference[c * self.plane + at] = ti.cast(image[y, x, c], self.real) / 255.0
-            self.valid[at] = ti.cast(image[y, x, 3], self.real) / 255.0
+            self.take_pixel(i % width, i // width, image)
+
+    @ti.func
+    def take_pixel(self, x, y, image: ti.template()):
+        """Take a pixel of the reference image."""
+        at = (y + PAD) * self.stride + PAD + x
+        for c in ti.static(range(3)):
+            self.reference[c * self.plane + at] = ti.cast(image[y, x, c], self.real) / 255.0
+        self.valid[at] = ti.cast(image[y, x, 3], self.real) / 255.0
 
     @ti.kernel
     def _set_gradients(

@@ -2,6 +2,7 @@
 # pyright: reportInvalidTypeForm=false
 
 import numpy as np
+import torch
 from numpy.typing import ArrayLike
 
 from fields.geometry.camera import PinholeCamera
@@ -25,6 +26,7 @@ class ViewField:
         limits: Bounds (left, right, top, bottom) of x/z and y/z within which the projection is linearised.
         near: Depth below which nothing is drawn [scene units].
         size: Width and height [px].
+        values: The numbers of these fields (21,) as kernels take them, but for the size.
     """
 
     def __init__(self, builder: ti.FieldsBuilder, real=ti.f32) -> None:
@@ -38,12 +40,16 @@ class ViewField:
         self.near = ti.field(real)
         self.size = ti.Vector.field(2, ti.i32)
         builder.place(self.rotation, self.translation, self.focal, self.centre, self.limits, self.near, self.size)
-        self._write = CompiledKernel(self._set)
+        self._launch = CompiledKernel(self._set)
+        self.values: np.ndarray | torch.Tensor = np.zeros(21, dtype=self.dtype)
         self.width = 0
         self.height = 0
 
     def set(self, camera: PinholeCamera, T_camera_world: ArrayLike, near: float) -> None:
-        """Set the view: a pose (4, 4), and the depth below which nothing is drawn [scene units]."""
+        """Set the view: a pose (4, 4), and the depth below which nothing is drawn [scene units].
+
+        On a GPU, the fields are written by the first kernel of the projection.
+        """
         T = np.asarray(T_camera_world, dtype=np.float64)
         fx, fy, cx, cy, width, height = camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height
         margin_x, margin_y = FRUSTUM_MARGIN * 0.5 * width / fx, FRUSTUM_MARGIN * 0.5 * height / fy
@@ -52,23 +58,30 @@ class ViewField:
         values[:9], values[9:12] = T[:3, :3].reshape(9), T[:3, 3]
         values[12:] = (fx, fy, cx, cy, *limits, near)
         self.width, self.height = width, height
-        self._write(without_waiting(values), width, height)
+        self.values = without_waiting(values)
+        if not on_gpu():
+            self._launch(self.values, width, height)
 
     @ti.kernel
     def _set(self, values: ti.types.ndarray(), width: ti.i32, height: ti.i32):
         ti.loop_config(serialize=True)
         for _ in range(1):
-            for r in ti.static(range(3)):
-                for c in ti.static(range(3)):
-                    self.rotation[None][r, c] = values[3 * r + c]
-                self.translation[None][r] = values[9 + r]
-            for c in ti.static(range(2)):
-                self.focal[None][c] = values[12 + c]
-                self.centre[None][c] = values[14 + c]
-            for c in ti.static(range(4)):
-                self.limits[None][c] = values[16 + c]
-            self.near[None] = values[20]
-            self.size[None] = ti.Vector([width, height])
+            self.write(values, width, height)
+
+    @ti.func
+    def write(self, values: ti.template(), width, height):
+        """Write `values` to the fields."""
+        for r in ti.static(range(3)):
+            for c in ti.static(range(3)):
+                self.rotation[None][r, c] = values[3 * r + c]
+            self.translation[None][r] = values[9 + r]
+        for c in ti.static(range(2)):
+            self.focal[None][c] = values[12 + c]
+            self.centre[None][c] = values[14 + c]
+        for c in ti.static(range(4)):
+            self.limits[None][c] = values[16 + c]
+        self.near[None] = values[20]
+        self.size[None] = ti.Vector([width, height])
 
 
 BLOCK = 1024

@@ -138,7 +138,6 @@ class StillScorer:
             frame: The frame. The renderer's images hold its render.
             render: The same render, with the colour developed and clipped.
         """
-        images = self._pipeline.renderer.images
         coarse = coarse_view(render, frame.rgba, frame.camera, self._version.trajectory[frame.index])
         around = neighbours(place_of(self._views, frame.index), len(self._views))
         mask = soft_mask(*moving(coarse, [self._coarse[i] for i in around], kept=False))
@@ -146,8 +145,7 @@ class StillScorer:
         if mask is not None:
             size = (frame.camera.width, frame.camera.height)
             rgba[np.asarray(cv2.resize(mask, size, interpolation=cv2.INTER_LINEAR)) < 255] = 0
-        images.set_reference(rgba)
-        values = self._pipeline.loss.forward()
+        values = self._pipeline.loss.forward(rgba)
         moving_share = 1.0 - (rgba[..., 3] > 0).sum() / max((frame.rgba[..., 3] > 0).sum(), 1)
         return StillScore(values.psnr, values.ssim, float(moving_share))
 
@@ -249,8 +247,7 @@ def _compare(
     renderer.forward(frame.camera, T_camera_world, pipeline.near)
     renderer.develop(exposure, frame.vignette)
     renderer.images.clip_colour()
-    renderer.images.set_reference(frame.rgba)
-    return pipeline.loss.forward()
+    return pipeline.loss.forward(frame.rgba)
 
 
 def evaluate(

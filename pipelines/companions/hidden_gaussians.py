@@ -72,6 +72,7 @@ class Contribution:
             i = self.projected.gaussian[s]
             here = pixels * ti.cast(self.projected.colour.grad[s][0], ti.f32)
             self.gaussians.coverage[i] = ti.max(self.gaussians.coverage[i], here)
+            self.gaussians.touched[i] = 0  # a GPU's compositing expects that projection adds gradients
 
 
 # Number of keyframes before a sweep whose Gaussians may still grow, and are not removed.

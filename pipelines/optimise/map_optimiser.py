@@ -91,8 +91,7 @@ class MapOptimiser:
         image = view.image(level)
         self.renderer.forward(image.camera, view.T_camera_world, self.settings.near * scene_depth, exact)
         self.renderer.develop(view.exposure, view.vignette)
-        self.renderer.images.set_reference(image.rgba)
-        return self.loss.forward()
+        return self.loss.forward(image.rgba)
 
     def step(
         self, store: KeyframeStore, views: list[int], rates: LearningRates, pose_rate: float, level: int = 0

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fields.buffers.device_pairs import DevicePairs
 from fields.buffers.images import ImageBuffers
@@ -97,7 +98,7 @@ class PhotometricStage(Protocol):
 
 
 class LossStage(Protocol):
-    """Compares `images.colour` with `images.reference` at the pixels of `images.valid`.
+    """Compares `images.colour` with a reference image at its valid pixels.
 
     Attributes:
         lag: Number of steps after which the values should be read, so that the host does not wait: 0 on the CPU, where
@@ -106,8 +107,8 @@ class LossStage(Protocol):
 
     lag: int
 
-    def forward(self) -> LossValues:
-        """Evaluate the loss, and write the SSIM map to `images.ssim`.
+    def forward(self, rgba: NDArray[np.uint8]) -> LossValues:
+        """Evaluate the loss against an image as in `ImageBuffers.set_reference`. Writes the SSIM map to `images.ssim`.
 
         Masked pixels of the render are replaced by the reference, so that they do not affect any window. On a GPU, the
         values wait for the device when they are read.
@@ -138,10 +139,11 @@ def make_stages(
 ) -> Stages:
     """Make the stages of a renderer in the form of the running device, which is that of `pairs`."""
     if isinstance(pairs, DevicePairs):
+        binning = DeviceBinning(view, projected, pairs)
         return (
-            DeviceProjection(gaussians, view, projected),
-            DeviceBinning(view, projected, pairs),
-            DeviceCompositing(view, projected, pairs, images),
+            DeviceProjection(gaussians, view, projected, binning),
+            binning,
+            DeviceCompositing(gaussians, binning, images),
             DevicePhotometric(images),
             DevicePhotometricLoss(images),
         )

@@ -15,7 +15,7 @@ from modp_ti.files.errors import InputError
 
 # The compositing kernels: those that must not spill, and of which the first two are in every step.
 COMPOSITING = {
-    "DeviceCompositing._forward": "forward",
+    "DeviceCompositing._forward, loop 2": "forward",
     "DeviceCompositing._backward": "backward",
     "DeviceCompositing._backward_with_depth": "backward with depth",
 }

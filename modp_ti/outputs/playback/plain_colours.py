@@ -60,8 +60,7 @@ def with_plain_colours(run: FinishedRun, line: ProgressLine) -> dict[str, NDArra
         order = order or rng.permutation(len(views)).tolist()
         camera, T, picture = views[order.pop()]
         renderer.forward(camera, T, run.record.near)
-        renderer.images.set_reference(picture)
-        loss.forward()
+        loss.forward(picture)
         loss.backward(SSIM_WEIGHT)
         renderer.backward()
         decayed = DECAY ** (step / STEPS)

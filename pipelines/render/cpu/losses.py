@@ -9,6 +9,7 @@ and e_yy only through their sum, which saves one convolution.
 # pyright: reportIndexIssue=false, reportInvalidTypeForm=false, reportOptionalCall=false, reportOptionalSubscript=false
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fields.buffers.images import PAD, SCRATCH_ROWS, STRIPS, ImageBuffers
 from fields.runtime.compiled_kernel import HANDED_OUT, CompiledKernel, CompiledLoop
@@ -49,7 +50,8 @@ class PhotometricLoss:
         self._mask, self._compare = CompiledLoop(self._mask_rows, 8), CompiledKernel(self._compare_strips)
         self._differentiate = CompiledKernel(self._differentiate_strips)
 
-    def forward(self) -> LossValues:
+    def forward(self, rgba: NDArray[np.uint8]) -> LossValues:
+        self.images.set_reference(rgba)
         width, height = self.images.width, self.images.height
         if self.images.masked:
             self._mask(width * height, width, height)

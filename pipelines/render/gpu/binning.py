@@ -21,37 +21,40 @@ PATIENCE = 2
 
 @ti.data_oriented
 class DeviceBinning(EllipseFormulas):
-    """Fills `pairs` from `projected` for the view in `view`; see `Binning`."""
+    """Fills `pairs` from `projected` for the view in `view`; see `Binning`.
+
+    The projection counts the tiles of each slot, and compositing arranges the sorted pairs, which saves launches.
+    """
 
     tile_width, tile_height = TILE_WIDTH, TILE_HEIGHT
 
     def __init__(self, view: ViewField, projected: ProjectedGaussians, pairs: DevicePairs) -> None:
         super().__init__(view, projected)
         self.pairs = pairs
-        self._count_tiles, self._emit_pairs = CompiledKernel(self._count_all), CompiledKernel(self._emit)
-        self._arrange_pairs = CompiledKernel(self._arrange)
+        self._emit_pairs = CompiledKernel(self._emit)
         self._totals: deque[AsyncReadback] = deque()
         self._known: deque[int] = deque(maxlen=MEMORY)
         self._counts = torch.empty(0, dtype=torch.int32, device=torch_device())
+        self._slots = 0
+
+    def tiles(self) -> tuple[int, int]:
+        """Number of the view's columns and rows of tiles."""
+        return -(-self.view.width // TILE_WIDTH), -(-self.view.height // TILE_HEIGHT)
+
+    def make_counts(self, slots: int) -> torch.Tensor:
+        """Return the array (slots,) for the number of tiles that each slot reaches."""
+        self._slots = slots
+        if len(self._counts) < slots:
+            self._counts = torch.empty(1 << (slots - 1).bit_length(), dtype=torch.int32, device=torch_device())
+        return self._counts[:slots]
 
     def forward(self, exact: bool = True) -> None:
-        tiles_x = -(-self.view.width // TILE_WIDTH)
-        tiles_y = -(-self.view.height // TILE_HEIGHT)
-        n, pairs = self.projected.count, self.pairs
-        if n == 0:
-            self._clear(tiles_x * tiles_y)
-            return
-        if len(self._counts) < n:
-            self._counts = torch.empty(1 << (n - 1).bit_length(), dtype=torch.int32, device=torch_device())
-        counts = self._counts[:n]
-        self._count_tiles(tiles_x, tiles_y, counts)
-        ends = torch.cumsum(counts, 0)
+        pairs = self.pairs
+        ends = torch.cumsum(self._counts[: self._slots], 0)
         self._make_room(ends, exact)
-        no_tile = NO_TILE[pairs.key.dtype]
         used = pairs.key[: pairs.room]
-        self._emit_pairs(pairs.room, no_tile, tiles_x, tiles_y, ends, used, pairs.emitted_slot)
-        key, pairs.origin = torch.sort(used, stable=True)
-        self._arrange_pairs(tiles_x * tiles_y, tiles_x, key, pairs.origin, pairs.emitted_slot, pairs.slot, pairs.rows)
+        self._emit_pairs(pairs.room, NO_TILE[pairs.key.dtype], *self.tiles(), ends, used, pairs.emitted_slot)
+        pairs.tile, pairs.origin = torch.sort(used, stable=True)
 
     def _make_room(self, ends: torch.Tensor, exact: bool) -> None:
         self._totals.append(AsyncReadback(ends[-1:]))
@@ -65,25 +68,17 @@ class DeviceBinning(EllipseFormulas):
             )
         self.pairs.make_room(max(int(MARGIN * max(self._known)), 1))
 
-    @ti.kernel
-    def _clear(self, tiles: ti.i32):
-        for t in range(tiles):
-            self.pairs.first[t] = 0
-            self.pairs.tile_count[t] = 0
-            self.pairs.total[None] = 0
-
-    @ti.kernel
-    def _count_all(self, tiles_x: ti.i32, tiles_y: ti.i32, counts: ti.types.ndarray(dtype=ti.i32, ndim=1)):
-        for s in range(counts.shape[0]):
-            n = 0
-            if s < self.projected.seen[None]:
-                e = self._ellipse(s)
-                if e[4] > 0.0:
-                    rows = self._tile_rows(s, e, tiles_y)
-                    for tile_y in range(rows[0], rows[1]):
-                        columns = self._tile_columns(s, e, tile_y, tiles_x)
-                        n += ti.max(columns[1] - columns[0], 0)
-            counts[s] = n
+    @ti.func
+    def count_tiles(self, s, tiles_x, tiles_y):
+        """Number of tiles that slot s reaches."""
+        n = 0
+        e = self._ellipse(s)
+        if e[4] > 0.0:
+            rows = self._tile_rows(s, e, tiles_y)
+            for tile_y in range(rows[0], rows[1]):
+                columns = self._tile_columns(s, e, tile_y, tiles_x)
+                n += ti.max(columns[1] - columns[0], 0)
+        return n
 
     @ti.kernel
     def _emit(
@@ -96,52 +91,51 @@ class DeviceBinning(EllipseFormulas):
         key: ti.types.ndarray(ndim=1),
         slot: ti.types.ndarray(dtype=ti.i32, ndim=1),
     ):
-        for s in range(self.projected.seen[None]):
-            place = ti.i64(0)
-            if s > 0:
-                place = ends[s - 1]
-            pair = ti.cast(ti.min(place, ti.cast(room, ti.i64)), ti.i32)
-            self.projected.first_pair[s] = pair
-            e = self._ellipse(s)
-            if e[4] > 0.0 and pair < room:
-                rows = self._tile_rows(s, e, tiles_y)
-                for tile_y in range(rows[0], rows[1]):
-                    columns = self._tile_columns(s, e, tile_y, tiles_x)
-                    for tile_x in range(columns[0], ti.min(columns[1], columns[0] + room - pair)):
-                        key[pair] = tile_y * tiles_x + tile_x
-                        slot[pair] = s
-                        pair += 1
-        for pair in range(room):
-            if pair >= ends[ends.shape[0] - 1]:
-                key[pair] = no_tile
-        # Clamped to room + 1, so that it fits in 32 bits.
-        self.pairs.total[None] = ti.cast(ti.min(ends[ends.shape[0] - 1], ti.cast(room, ti.i64) + 1), ti.i32)
+        n, tiles = ends.shape[0], tiles_x * tiles_y
+        for i in range(ti.max(n, room, tiles)):
+            # Clamped to room + 1, so that it fits in 32 bits.
+            total = ti.cast(ti.min(ends[n - 1], ti.cast(room, ti.i64) + 1), ti.i32)
+            if i == 0:
+                self.pairs.total[None] = total
+            if i < tiles:
+                self.pairs.first[i] = 0
+                self.pairs.tile_count[i] = 0
+            if total <= i and i < room:
+                key[i] = no_tile
+            if i < self.projected.seen[None]:
+                self._emit_slot(i, room, tiles_x, tiles_y, ends, key, slot)
 
-    @ti.kernel
-    def _arrange(
-        self,
-        tiles: ti.i32,
-        tiles_x: ti.i32,
-        key: ti.types.ndarray(ndim=1),
-        origin: ti.types.ndarray(dtype=ti.i64, ndim=1),
-        emitted_slot: ti.types.ndarray(dtype=ti.i32, ndim=1),
-        slot: ti.types.ndarray(dtype=ti.i32, ndim=1),
-        rows: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    ):
-        for t in range(tiles):
-            self.pairs.first[t] = 0
-            self.pairs.tile_count[t] = 0
-        n = key.shape[0]
-        for k in range(n):
-            tile = ti.cast(key[k], ti.i32)
-            if tile < tiles:
-                s = emitted_slot[origin[k]]
-                slot[k] = s
-                # Computed here and not in `_emit`, since here each pair has its own thread.
-                rows[k] = self._pixel_rows(s, self._ellipse(s), tile % tiles_x, tile // tiles_x)
-                if k == 0 or ti.cast(key[ti.max(k - 1, 0)], ti.i32) != tile:
-                    self.pairs.first[tile] = k
-                if k + 1 == n or ti.cast(key[ti.min(k + 1, n - 1)], ti.i32) != tile:
-                    self.pairs.tile_count[tile] = k + 1
-        for t in range(tiles):
-            self.pairs.tile_count[t] = self.pairs.tile_count[t] - self.pairs.first[t]
+    @ti.func
+    def _emit_slot(self, s, room, tiles_x, tiles_y, ends: ti.template(), key: ti.template(), slot: ti.template()):
+        place = ti.i64(0)
+        if s > 0:
+            place = ends[s - 1]
+        pair = ti.cast(ti.min(place, ti.cast(room, ti.i64)), ti.i32)
+        self.projected.first_pair[s] = pair
+        e = self._ellipse(s)
+        if e[4] > 0.0 and pair < room:
+            rows = self._tile_rows(s, e, tiles_y)
+            for tile_y in range(rows[0], rows[1]):
+                columns = self._tile_columns(s, e, tile_y, tiles_x)
+                for tile_x in range(columns[0], ti.min(columns[1], columns[0] + room - pair)):
+                    key[pair] = tile_y * tiles_x + tile_x
+                    slot[pair] = s
+                    pair += 1
+
+    @ti.func
+    def arrange(
+        self, k, tiles, tiles_x, key: ti.template(), origin: ti.template(), emitted: ti.template(),
+        slot: ti.template(), rows: ti.template(),
+    ):  # fmt: skip
+        """Find the slot and rows of the sorted pair k, and where its tile begins and ends."""
+        tile, n = ti.cast(key[k], ti.i32), key.shape[0]
+        if tile < tiles:
+            s = emitted[origin[k]]
+            slot[k] = s
+            # Computed here and not in `_emit`, since here each pair has its own thread.
+            rows[k] = self._pixel_rows(s, self._ellipse(s), tile % tiles_x, tile // tiles_x)
+            if k == 0 or ti.cast(key[ti.max(k - 1, 0)], ti.i32) != tile:
+                self.pairs.first[tile] = k
+                ti.atomic_add(self.pairs.tile_count[tile], -k)
+            if k + 1 == n or ti.cast(key[ti.min(k + 1, n - 1)], ti.i32) != tile:
+                ti.atomic_add(self.pairs.tile_count[tile], k + 1)

@@ -6,14 +6,13 @@ backward pass also goes front to back, in the phases of `compositing_gradient.py
 # pyright: reportArgumentType=false, reportGeneralTypeIssues=false, reportIndexIssue=false
 # pyright: reportInvalidTypeForm=false, reportOptionalSubscript=false
 
-import torch
-
-from fields.buffers.device_pairs import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, DevicePairs
+from fields.buffers.device_pairs import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH
 from fields.buffers.images import PAD, ImageBuffers
-from fields.buffers.view import ProjectedGaussians, ViewField
+from fields.map.gaussians import GaussianField
 from fields.runtime.compiled_kernel import CompiledKernel
 from fields.runtime.engine import ti
 from pipelines.render.formulas import ALPHA_MAX, ALPHA_MIN, OPAQUE
+from pipelines.render.gpu.binning import DeviceBinning
 from pipelines.render.gpu.compositing_gradient import (
     COLUMNS,
     ROW_BITS,
@@ -36,35 +35,30 @@ TILE_BITS = TILE_PIXELS.bit_length() - 1
 assert THREADS == TILE_PIXELS == BATCH
 
 INDICES = ti.types.ndarray(dtype=ti.i32, ndim=1)
+PLACES = ti.types.ndarray(dtype=ti.i64, ndim=1)
+SUMMED = ti.types.ndarray(dtype=ti.f32, ndim=1)
 
 
 @ti.data_oriented
 class DeviceCompositing:
     """Composites `projected` into `images` by the lists in `pairs`, and propagates gradients back."""
 
-    def __init__(
-        self, view: ViewField, projected: ProjectedGaussians, pairs: DevicePairs, images: ImageBuffers
-    ) -> None:
-        self.view = view
-        self.projected = projected
-        self.pairs = pairs
-        self.images = images
+    def __init__(self, gaussians: GaussianField, binning: DeviceBinning, images: ImageBuffers) -> None:
+        self.gaussians, self.binning, self.images = gaussians, binning, images
+        self.view, self.projected, self.pairs = binning.view, binning.projected, binning.pairs
         self._composite, self._add_up = CompiledKernel(self._forward), CompiledKernel(self._gather)
         self._differentiate = {False: CompiledKernel(self._backward), True: CompiledKernel(self._backward_with_depth)}
-        self._no_indices = torch.zeros(1, dtype=torch.int32, device=pairs.device)
 
     def forward(self) -> None:
-        pairs, any_pairs = self.pairs, self.pairs.capacity > 0
-        slot, rows = (pairs.slot, pairs.rows) if any_pairs else (self._no_indices, self._no_indices)
-        self._composite(self.view.width, self.view.height, slot, rows)
+        pairs = self.pairs
+        lists = (pairs.tile, pairs.origin, pairs.emitted_slot, pairs.slot, pairs.rows)
+        self._composite(self.view.width, self.view.height, *lists)
 
     def backward(self, with_depth: bool = False) -> None:
         pairs = self.pairs
-        if self.projected.count:
-            width, height = self.view.width, self.view.height
-            differentiate = self._differentiate[with_depth]
-            differentiate(width, height, pairs.slot, pairs.rows, pairs.origin, pairs.gradient)
-            self._add_up(pairs.room, pairs.gradient)
+        lists = (pairs.slot, pairs.rows, pairs.origin, pairs.gradient)
+        self._differentiate[with_depth](self.view.width, self.view.height, *lists)
+        self._add_up(pairs.room, pairs.gradient)
 
     @ti.func
     def _load(self, store: ti.template(), place, s):
@@ -95,11 +89,25 @@ class DeviceCompositing:
         self.images.opacity[target] = 1.0 - T
 
     @ti.kernel
-    def _forward(self, width: ti.i32, height: ti.i32, slot: INDICES, rows: INDICES):
+    def _forward(
+        self,
+        width: ti.i32,
+        height: ti.i32,
+        tile_of: ti.types.ndarray(ndim=1),
+        origin: PLACES,
+        emitted: INDICES,
+        slot: INDICES,
+        rows: INDICES,
+    ):
         tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
         tiles = tiles_x * ((height + TILE_HEIGHT - 1) // TILE_HEIGHT)
+        # Bounds of all loops come first: each group of such lines is a launch.
+        pixels = tiles * TILE_PIXELS
+        for k in range(tile_of.shape[0]):
+            self.binning.arrange(k, tiles, tiles_x, tile_of, origin, emitted, slot, rows)
+
         ti.loop_config(block_dim=TILE_PIXELS)
-        for i in range(tiles * TILE_PIXELS):
+        for i in range(pixels):
             splats = ti.simt.block.SharedArray((BATCH * WIDTH,), ti.f32)
             spans = ti.simt.block.SharedArray((BATCH,), ti.i32)
             # Whether any pixel of the tile is not opaque yet, alternating between batches.
@@ -158,15 +166,7 @@ class DeviceCompositing:
                 self._write_pixel(x, y, red, green, blue, z, T)
 
     @ti.kernel
-    def _backward(
-        self,
-        width: ti.i32,
-        height: ti.i32,
-        slot: INDICES,
-        rows: INDICES,
-        origin: ti.types.ndarray(dtype=ti.i64, ndim=1),
-        gradient: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    ):
+    def _backward(self, width: ti.i32, height: ti.i32, slot: INDICES, rows: INDICES, origin: PLACES, gradient: SUMMED):
         tiles = ((width + TILE_WIDTH - 1) // TILE_WIDTH) * ((height + TILE_HEIGHT - 1) // TILE_HEIGHT)
         ti.loop_config(block_dim=TILE_PIXELS)
         for i in range(tiles * TILE_PIXELS):
@@ -174,13 +174,7 @@ class DeviceCompositing:
 
     @ti.kernel
     def _backward_with_depth(
-        self,
-        width: ti.i32,
-        height: ti.i32,
-        slot: INDICES,
-        rows: INDICES,
-        origin: ti.types.ndarray(dtype=ti.i64, ndim=1),
-        gradient: ti.types.ndarray(dtype=ti.f32, ndim=1),
+        self, width: ti.i32, height: ti.i32, slot: INDICES, rows: INDICES, origin: PLACES, gradient: SUMMED
     ):
         tiles = ((width + TILE_WIDTH - 1) // TILE_WIDTH) * ((height + TILE_HEIGHT - 1) // TILE_HEIGHT)
         ti.loop_config(block_dim=TILE_PIXELS)
@@ -270,8 +264,10 @@ class DeviceCompositing:
         clear_pairs(thread, first + reached, count - reached, origin, gradient)
 
     @ti.kernel
-    def _gather(self, room: ti.i32, gradient: ti.types.ndarray(dtype=ti.f32, ndim=1)):
+    def _gather(self, room: ti.i32, gradient: SUMMED):
         """Sum the pairs of every slot, in order, into the gradients of its composited values.
+
+        Also mark its Gaussian as touched, and clear the gradient of its camera tangent for the projection.
 
         Each slot has sixteen threads, ten of which compute one sum each, so that they read a pair's gradient together.
         """
@@ -304,4 +300,6 @@ class DeviceCompositing:
                 self.projected.conic.grad[s] = ti.Vector(
                     [-0.5 * totals[at + 7], -totals[at + 8], -0.5 * totals[at + 9]]
                 )
+                self.projected.tangent.grad[s].fill(0.0)
+                self.gaussians.touched[self.projected.gaussian[s]] = 1
             ti.simt.block.sync()

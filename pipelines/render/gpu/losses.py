@@ -9,6 +9,7 @@ from functools import partial
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from fields.buffers.device_pairs import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, tile_count
 from fields.buffers.images import PAD, ImageBuffers
@@ -16,7 +17,7 @@ from fields.runtime.backend import torch_device
 from fields.runtime.compiled_kernel import AsyncReadback, CompiledKernel
 from fields.runtime.engine import ti
 from pipelines.render.formulas import C1, C2, RADIUS, LossValues, window_weights
-from pipelines.render.gpu.reductions import THREAD_BITS, THREADS, BlockSums, sum_over_block
+from pipelines.render.gpu.reductions import THREAD_BITS, THREADS, partial_sums, sum_blocks, sum_over_block
 
 # Side of a tile with the border that its windows reach.
 SIDE = TILE_WIDTH + 2 * RADIUS
@@ -56,30 +57,28 @@ class _Values:
 
 @ti.data_oriented
 class DevicePhotometricLoss:
-    """Compares `images.colour` with `images.reference`. Its values are read asynchronously."""
+    """Compares `images.colour` with a reference image. Its values are read asynchronously."""
 
     lag = 1
 
     def __init__(self, images: ImageBuffers) -> None:
         self.images = images
         self.weights = window_weights()
-        self._partial = torch.zeros(12 * tile_count(images.max_width, images.max_height), device=torch_device())
+        self._partial = partial_sums(3 * tile_count(images.max_width, images.max_height), 4)
         self._totals = torch.zeros(4, dtype=torch.float32, device=torch_device())
         self._compare, self._differentiate = (
             CompiledKernel(self._compare_tiles),
             CompiledKernel(self._differentiate_tiles),
         )
-        self._sum = BlockSums(4)
         self._values = _Values()
 
-    def forward(self) -> LossValues:
+    def forward(self, rgba: NDArray[np.uint8]) -> LossValues:
         if self._values.written == ROWS:
             self._values = _Values()
         values, row = self._values, self._values.written
-        width, height = self.images.width, self.images.height
-        self._compare(width, height, self._partial)
         self._totals = values.sums[row]
-        self._sum(3 * tile_count(width, height), self._partial, self._totals)
+        images = self.images
+        self._compare(images.width, images.height, images.on_device(rgba), self._partial, self._totals)
         values.written += 1
         return LossValues(partial(values.row, row))
 
@@ -156,15 +155,24 @@ class DevicePhotometricLoss:
         return S
 
     @ti.kernel
-    def _compare_tiles(self, width: ti.i32, height: ti.i32, partial: NUMBERS):
+    def _compare_tiles(
+        self,
+        width: ti.i32,
+        height: ti.i32,
+        image: ti.types.ndarray(dtype=ti.u8, ndim=3),
+        partial: NUMBERS,
+        totals: NUMBERS,
+    ):
         plane = ti.static(self.images.plane)
-        for i in range(width * height):
-            self._replace_masked((i // width + PAD) * self.images.stride + i % width + PAD)
-
         tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
         tiles = tiles_x * ((height + TILE_HEIGHT - 1) // TILE_HEIGHT)
+        units, threads = 3 * tiles, 3 * tiles * THREADS
+        for i in range(width * height):
+            self.images.take_pixel(i % width, i // width, image)
+            self._replace_masked((i // width + PAD) * self.images.stride + i % width + PAD)
+
         ti.loop_config(block_dim=THREADS)
-        for i in range(3 * tiles * THREADS):
+        for i in range(threads):
             a = ti.simt.block.SharedArray((HALO,), ti.f32)
             b = ti.simt.block.SharedArray((HALO,), ti.f32)
             # First the four moments after the horizontal window, then the four sums.
@@ -202,6 +210,7 @@ class DevicePhotometricLoss:
             sum_over_block(band, thread, 4)
             if thread < 4:
                 partial[unit * 4 + thread] = band[thread * THREADS]
+        sum_blocks(units, partial, totals, 4)
 
     @ti.kernel
     def _differentiate_tiles(

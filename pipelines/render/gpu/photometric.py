@@ -9,7 +9,7 @@ from fields.runtime.backend import torch_device, without_waiting
 from fields.runtime.compiled_kernel import AsyncReadback, CompiledKernel
 from fields.runtime.engine import ti
 from pipelines.render.formulas import PhotometricBuffers
-from pipelines.render.gpu.reductions import THREAD_BITS, THREADS, BlockSums, sum_over_block
+from pipelines.render.gpu.reductions import THREAD_BITS, THREADS, partial_sums, sum_blocks, sum_over_block
 
 NUMBERS = ti.types.ndarray(dtype=ti.f32, ndim=1)
 
@@ -20,13 +20,11 @@ class DevicePhotometric(PhotometricBuffers):
 
     def __init__(self, images: ImageBuffers) -> None:
         super().__init__(images)
-        blocks = -(-images.max_width * images.max_height // THREADS)
-        self._partial = torch.zeros(12 * blocks, dtype=torch.float32, device=torch_device())
+        self._partial = partial_sums(-(-images.max_width * images.max_height // THREADS), 12)
         self._forward_pixels, self._backward_pixels = (
             CompiledKernel(self._develop_pixels),
             CompiledKernel(self._undevelop_pixels),
         )
-        self._sum = BlockSums(12)
         self._gradient = torch.zeros(12, dtype=torch.float32, device=torch_device())
 
     def exposure_gradient(self) -> np.ndarray:
@@ -40,9 +38,7 @@ class DevicePhotometric(PhotometricBuffers):
         self._forward_pixels(self.images.width, self.images.height, self._numbers)
 
     def _undevelop(self) -> None:
-        width, height = self.images.width, self.images.height
-        self._backward_pixels(width, height, self._numbers, self._partial)
-        self._sum(-(-width * height // THREADS), self._partial, self._gradient)
+        self._backward_pixels(self.images.width, self.images.height, self._numbers, self._partial, self._gradient)
 
     @ti.kernel
     def _develop_pixels(self, width: ti.i32, height: ti.i32, exposure: NUMBERS):
@@ -57,7 +53,7 @@ class DevicePhotometric(PhotometricBuffers):
                 self.images.colour[c * plane + p] = developed * self.vignette[c * plane + p]
 
     @ti.kernel
-    def _undevelop_pixels(self, width: ti.i32, height: ti.i32, exposure: NUMBERS, partial: NUMBERS):
+    def _undevelop_pixels(self, width: ti.i32, height: ti.i32, exposure: NUMBERS, partial: NUMBERS, gradient: NUMBERS):
         blocks = (width * height + THREADS - 1) // THREADS
         ti.loop_config(block_dim=THREADS)
         for i in range(blocks * THREADS):
@@ -84,3 +80,4 @@ class DevicePhotometric(PhotometricBuffers):
             sum_over_block(store, thread, 12)
             if thread < 12:
                 partial[(i >> THREAD_BITS) * 12 + thread] = store[thread * THREADS]
+        sum_blocks(blocks, partial, gradient, 12)

@@ -10,6 +10,7 @@ from fields.runtime.backend import torch_device
 from fields.runtime.compiled_kernel import AsyncReadback, CompiledKernel
 from fields.runtime.engine import ti
 from pipelines.render.formulas import ProjectionFormulas
+from pipelines.render.gpu.binning import DeviceBinning
 from pipelines.render.gpu.reductions import THREAD_BITS, THREADS, sum_over_block
 
 # Sorts after every depth. Not infinity, since Taichi's fast-math assumes that there is none.
@@ -17,46 +18,41 @@ UNSEEN = 3e38
 # Number of blocks that sum the slots' tangents. The host adds their sums, which saves a launch.
 BLOCKS = 64
 
+NUMBERS = ti.types.ndarray(dtype=ti.f32, ndim=1)
+
 
 @ti.data_oriented
 class DeviceProjection(ProjectionFormulas):
     """Culls, sorts and projects `gaussians` into `projected`, with the formulas of the CPU.
 
-    The differentiable loops go over slots, which come in the order of depth: a GPU adds to gradients with atomics that
-    cost it little.
+    Slots come in the order of depth: a GPU adds to gradients with atomics that cost it little.
     """
 
-    def __init__(self, gaussians: GaussianField, view: ViewField, projected: ProjectedGaussians) -> None:
+    def __init__(
+        self, gaussians: GaussianField, view: ViewField, projected: ProjectedGaussians, binning: DeviceBinning
+    ) -> None:
         super().__init__(gaussians, view, projected, projected.tangent)
+        self.binning = binning
         self._depths = torch.empty(0, dtype=torch.float32, device=torch_device())
-        self._cull, self._assign = CompiledKernel(self._cull_all), CompiledKernel(self._assign_sorted)
+        self._cull, self._project = CompiledKernel(self._cull_all), CompiledKernel(self._project_all)
+        self._propagate = CompiledKernel(self._differentiable, reverse=True)
         self._sum_tangents = CompiledKernel(self._sum_all_tangents)
-        self._project, self._project_back = (CompiledKernel(self._project_slots, reverse) for reverse in (False, True))
-        self._shade, self._shade_back = (CompiledKernel(self._shade_slots, reverse) for reverse in (False, True))
-        self._clear = CompiledKernel(self._clear_tangent_gradients)
         self._tangents = torch.zeros((BLOCKS, 6), dtype=torch.float32, device=torch_device())
 
     def forward(self) -> int:
-        self.projected.count = n = self.gaussians.count
-        if n == 0:
-            self._none_seen()
-            return 0
+        self.projected.count = count = self.gaussians.count
+        n = max(count, 1)  # an array of zero elements has no address
         if len(self._depths) < n:
             self._depths = torch.empty(1 << (n - 1).bit_length(), dtype=torch.float32, device=torch_device())
         depths = self._depths[:n]
-        self._cull(depths)
+        self._cull(count, self.view.values, self.view.width, self.view.height, depths)
         # A stable sort keeps Gaussians of equal depth in order.
         ordered, gaussian = torch.sort(depths, stable=True)
-        self._assign(ordered, gaussian)
-        self._project()
-        self._shade()
-        return n
+        self._project(*self.binning.tiles(), ordered, gaussian, self.binning.make_counts(n))
+        return count
 
     def backward(self) -> None:
-        if self.projected.count:
-            self._clear()
-            self._shade_back()
-            self._project_back()
+        self._propagate()
 
     def camera_gradient(self) -> np.ndarray:
         return self.async_camera_gradient().numpy()
@@ -66,45 +62,47 @@ class DeviceProjection(ProjectionFormulas):
         return AsyncReadback(self._tangents, summed=True)
 
     @ti.kernel
-    def _none_seen(self):
+    def _cull_all(self, count: ti.i32, values: NUMBERS, width: ti.i32, height: ti.i32, depths: NUMBERS):
+        self.view.write(values, width, height)
         self.projected.seen[None] = 0
-
-    @ti.kernel
-    def _cull_all(self, depths: ti.types.ndarray(dtype=ti.f32, ndim=1)):
         for i in range(depths.shape[0]):
-            camera, stretch = self._camera()
-            depth = self._seen_at(i, camera, stretch)
+            depth = 0.0
+            if i < count:
+                camera, stretch = self._camera()
+                depth = self._seen_at(i, camera, stretch)
             depths[i] = ti.select(depth > 0.0, depth, UNSEEN)
 
     @ti.kernel
-    def _assign_sorted(
-        self, depths: ti.types.ndarray(dtype=ti.f32, ndim=1), gaussian: ti.types.ndarray(dtype=ti.i64, ndim=1)
+    def _project_all(
+        self,
+        tiles_x: ti.i32,
+        tiles_y: ti.i32,
+        depths: NUMBERS,
+        gaussian: ti.types.ndarray(dtype=ti.i64, ndim=1),
+        counts: ti.types.ndarray(dtype=ti.i32, ndim=1),
     ):
+        """Fill the slots, and count the tiles that each of them reaches."""
         n = depths.shape[0]
         for s in range(n):
+            tiles = 0
             if depths[s] < UNSEEN:
-                self.projected.gaussian[s] = ti.cast(gaussian[s], ti.i32)
+                i = ti.cast(gaussian[s], ti.i32)
+                self.projected.gaussian[s] = i
                 self.tangent[s].fill(0.0)
+                self._project_one(i, s, s)
+                self._shade_one(i, s, s)
+                tiles = self.binning.count_tiles(s, tiles_x, tiles_y)
                 if s + 1 == n or depths[ti.min(s + 1, n - 1)] >= UNSEEN:
                     self.projected.seen[None] = s + 1
-            elif s == 0:
-                self.projected.seen[None] = 0
+            counts[s] = tiles
 
     @ti.kernel
-    def _project_slots(self):
+    def _differentiable(self):
+        """What `_project_all` does, in a form whose reverse compiles quickly."""
         for s in range(self.projected.seen[None]):
             self._project_one(self.projected.gaussian[s], s, s)
-
-    @ti.kernel
-    def _shade_slots(self):
         for s in range(self.projected.seen[None]):
             self._shade_one(self.projected.gaussian[s], s, s)
-
-    @ti.kernel
-    def _clear_tangent_gradients(self):
-        for s in range(self.projected.seen[None]):
-            self.tangent.grad[s].fill(0.0)
-            self.gaussians.touched[self.projected.gaussian[s]] = 1
 
     @ti.kernel
     def _sum_all_tangents(self, out: ti.types.ndarray(dtype=ti.f32, ndim=2)):

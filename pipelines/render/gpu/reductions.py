@@ -7,13 +7,14 @@ arrays of the same name in a kernel are merged, with the size of either.
 
 import torch
 
-from fields.runtime.compiled_kernel import CompiledKernel
+from fields.runtime.backend import torch_device
 from fields.runtime.engine import ti
 
 # Threads of every block that reduces. Down to the last warp, both halves at each level of the sum are whole warps.
 THREADS = 256
 THREAD_BITS = THREADS.bit_length() - 1
-NUMBERS = ti.types.ndarray(dtype=ti.f32, ndim=1)
+# Threads of each value that add up the blocks' sums.
+LANES = 64
 
 
 @ti.func
@@ -42,29 +43,24 @@ def max_over_block(store: ti.template(), thread):
         ti.simt.block.sync()
 
 
-@ti.data_oriented
-class BlockSums:
-    """Sums the partial results of the blocks of an earlier kernel."""
+@ti.func
+def sum_blocks(blocks, partial: ti.template(), out: ti.template(), quantities: ti.template()):
+    """Sum value c over all blocks, from `partial[block * quantities + c]` to `out[c]`, in two loops of a kernel.
 
-    def __init__(self, quantities: int) -> None:
-        self.quantities = quantities
-        self._launch = CompiledKernel(self._add)
+    partial: From `partial_sums`.
+    """
+    for j in range(LANES * quantities):
+        total = 0.0
+        for k in range((blocks - j // quantities + LANES - 1) // LANES):
+            total += partial[j + k * LANES * quantities]
+        partial[partial.shape[0] - LANES * quantities + j] = total
+    for c in range(quantities):
+        total = 0.0
+        for lane in range(LANES):
+            total += partial[partial.shape[0] + (lane - LANES) * quantities + c]
+        out[c] = total
 
-    def __call__(self, blocks: int, partial: torch.Tensor, out: torch.Tensor) -> None:
-        """Sum value c over all blocks, from `partial[block * quantities + c]` to `out[c]`."""
-        self._launch(blocks, partial, out)
 
-    @ti.kernel
-    def _add(self, blocks: ti.i32, partial: NUMBERS, out: NUMBERS):
-        quantities = ti.static(self.quantities)
-        ti.loop_config(block_dim=THREADS)
-        for thread in range(THREADS):
-            store = ti.simt.block.SharedArray((quantities * THREADS,), ti.f32)
-            for c in ti.static(range(quantities)):
-                total = 0.0
-                for k in range((blocks - thread + THREADS - 1) >> THREAD_BITS):
-                    total += partial[(thread + k * THREADS) * quantities + c]
-                store[c * THREADS + thread] = total
-            sum_over_block(store, thread, quantities)
-            if thread < quantities:
-                out[thread] = store[thread * THREADS]
+def partial_sums(blocks: int, quantities: int) -> torch.Tensor:
+    """Return the array for the sums of at most so many blocks of a kernel."""
+    return torch.zeros((blocks + LANES) * quantities, dtype=torch.float32, device=torch_device())

@@ -33,8 +33,7 @@ def compared(renderer: Renderer, camera: PinholeCamera) -> dict[str, NDArray]:
     renderer.forward(camera, POSE, NEAR)
     renderer.develop(exposure, vignette)
     result = {"developed": renderer.images.colour_to_numpy()}
-    renderer.images.set_reference(image)
-    values = loss.forward()
+    values = loss.forward(image)
     result |= {"masked": renderer.images.colour_to_numpy(), "ssim": renderer.images.ssim_to_numpy()}
     loss.backward(0.3, 2.0)
     result["gradient"] = renderer.images.colour_gradient_to_numpy()
@@ -75,8 +74,7 @@ def test_values_are_right_whenever_they_are_read(results: tuple, monkeypatch: py
     def evaluate(grey: int) -> LossValues:
         image = np.full((CAMERA.height, CAMERA.width, 4), 255, dtype=np.uint8)
         image[..., :3] = grey
-        renderer.images.set_reference(image)
-        return loss.forward()
+        return loss.forward(image)
 
     levels = [10, 20, 30, 40, 50, 60, 70]
     values = [evaluate(levels[0])]

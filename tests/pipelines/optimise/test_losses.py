@@ -13,6 +13,7 @@ from fields.map.gaussians import GaussianField
 from fields.runtime.engine import ti
 from pipelines.optimise.adam import AspectPenalty
 from pipelines.render.cpu.losses import PhotometricLoss
+from pipelines.render.formulas import LossValues
 from pipelines.render.renderer import Renderer
 
 WIDTH, HEIGHT = 41, 33
@@ -34,24 +35,22 @@ def textures(seed: int) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     return np.clip(reference[..., :3] / 255 + rng.normal(0, 0.2, (HEIGHT, WIDTH, 3)), 0, 1), reference
 
 
-def put(loss: PhotometricLoss, render: NDArray, reference: NDArray) -> None:
+def compare(loss: PhotometricLoss, render: NDArray, reference: NDArray) -> LossValues:
     # The gradient buffers take any image; the rendered one is then copied from there.
     zeros = np.zeros((HEIGHT, WIDTH))
     loss.images.set_gradients(render, zeros, zeros)
     loss.images.colour.copy_from(loss.images.colour_grad)
-    loss.images.set_reference(reference)
+    return loss.forward(reference)
 
 
 def total(loss: PhotometricLoss, render: NDArray, reference: NDArray, weight: float) -> float:
-    put(loss, render, reference)
-    values = loss.forward()
+    values = compare(loss, render, reference)
     return (1 - weight) * values.l1 + weight * (1 - values.ssim)
 
 
 def test_ssim_is_that_of_scikit_image(losses: PhotometricLoss) -> None:
     render, reference = textures(1)
-    put(losses, render, reference)
-    losses.forward()
+    compare(losses, render, reference)
     _, expected = structural_similarity(
         render, reference[..., :3] / 255, gaussian_weights=True, sigma=1.5, use_sample_covariance=False,
         data_range=1.0, channel_axis=2, full=True,
@@ -62,8 +61,7 @@ def test_ssim_is_that_of_scikit_image(losses: PhotometricLoss) -> None:
 
 def test_l1_and_psnr_are_those_of_numpy(losses: PhotometricLoss) -> None:
     render, reference = textures(2)
-    put(losses, render, reference)
-    values = losses.forward()
+    values = compare(losses, render, reference)
     difference = render - reference[..., :3] / 255
     assert values.l1 == pytest.approx(np.abs(difference).mean())
     assert values.psnr == pytest.approx(-10 * np.log10((difference**2).mean()))
@@ -75,8 +73,7 @@ def test_the_gradient_is_that_of_finite_differences(losses: PhotometricLoss, wei
     render, reference = textures(4)
     if masked:
         reference[10:20, 5:30] = 0
-    put(losses, render, reference)
-    losses.forward()
+    compare(losses, render, reference)
     losses.backward(weight, scale=2.0)
     analytic = losses.images.colour_gradient_to_numpy()
     rng = np.random.default_rng(5)

@@ -58,8 +58,7 @@ def test_a_moved_pose_comes_back_when_only_poses_are_stepped(renderers: Callable
     refinement = PoseRefinement()
     for _ in range(80):
         renderer.forward(LENS, view.T_camera_world, NEAR)
-        renderer.images.set_reference(view.rgba)
-        loss.forward()
+        loss.forward(view.rgba)
         loss.backward(0.2)
         renderer.backward()
         refinement.step(view, renderer.camera_gradient(), 0.05)
