@@ -33,6 +33,7 @@ from modp_ti.outputs.formats.mesh import (
 from modp_ti.outputs.formats.sog import write_sog, write_sog_lod
 from modp_ti.outputs.formats.textured_mesh import painted, require_atlas, unwrapped, write_textured_mesh
 from modp_ti.outputs.formats.usd import USD_SUFFIXES, write_usd
+from modp_ti.outputs.measuring import Ruler
 from modp_ti.outputs.playback.film import VIDEO_SUFFIXES, film, plan_flight
 from modp_ti.outputs.playback.finished_run import FinishedRun
 from modp_ti.outputs.playback.map_renderer import MapRenderer, eight_bits, start_device
@@ -173,9 +174,10 @@ def _spz(run: FinishedRun, target: Path, options: ExportOptions, line: ProgressL
 def _page(run: FinishedRun, target: Path, options: ExportOptions, line: ProgressLine) -> None:
     """Write the page, and show the link to it in the run's report if it lies next to it under its default name."""
     with line.working("writing the page"):
-        upright = levelled(run)
+        upright, ruler = levelled(run), Ruler.of(run)
         state = moved(run.gaussians, upright.R, upright.scale)
-        write_splat_page(target, run.folder.absolute().name, viewer_settings(run, upright), state)
+        world = {"unit": ruler.unit, "scale": 1.0 / upright.scale, "deviation": ruler.deviation, "floor": None}
+        write_splat_page(target, run.folder.absolute().name, viewer_settings(run, upright), state, world)
         if target.resolve() == (run.folder / PAGE).resolve():
             show_link_to_map(run.folder / "report.html")
 

@@ -21,7 +21,7 @@ from modp_ti.outputs.playback.camera_paths import smoothed
 from modp_ti.outputs.playback.finished_run import FinishedRun
 from pipelines.render.spherical_harmonics import sh_rotation
 
-# The scene's depth in the page [m].
+# The scene's depth in the page [m], unless the map is in metres.
 DEPTH = 3.0
 # Weight of the cameras' y axes in the direction of gravity. It decides where the x axes leave the pitch open.
 HELD = 0.01
@@ -72,11 +72,13 @@ def level(poses: NDArray[np.float64], scene_depth: float) -> Levelled:
 
 
 def levelled(run: FinishedRun) -> Levelled:
-    """Return what makes a finished map upright: its `world.json` (`modp-ti scale`), else its cameras, see `level`."""
-    down = read_world(run.folder).get("down")
-    if down is None:
-        return level(run.poses, run.record.scene_depth)
-    return Levelled(turning(np.array(down), Y), DEPTH / run.record.scene_depth)
+    """Return what makes a finished map upright: its `world.json` (`modp-ti scale`), else its cameras, see `level`.
+
+    The scale of a map in metres stays.
+    """
+    world, found = read_world(run.folder), level(run.poses, run.record.scene_depth)
+    R = turning(np.array(world["down"]), Y) if "down" in world else found.R
+    return Levelled(R, 1.0 if world.get("unit") == "m" else found.scale)
 
 
 def moved(state: Mapping[str, NDArray], R: NDArray[np.float64], scale: float) -> dict[str, NDArray]:
@@ -160,6 +162,7 @@ def write_splat_page(
     name: str,
     settings: Mapping[str, Any],
     state: Mapping[str, NDArray] | None = None,
+    world: Mapping[str, Any] | None = None,
 ) -> None:
     """Write a page that shows Gaussians with SuperSplat's viewer, which takes 2.1 MB.
 
@@ -170,6 +173,8 @@ def write_splat_page(
         state: Gaussians by name, as from `GaussianField.to_numpy`, with y down. The page holds them as `.sog` in base
             85, which takes 25 percent more than its bytes, and requests nothing: a browser opens it from the disk. None
             for a page that shows the map of the `lod-meta.json` next to it, and loads what it shows from its server.
+        world: What to measure in, of a page that holds its map: `unit`, `scale` in units per page unit, its relative
+            `deviation`, and the `floor`'s height in the page or None. None for a page without measuring.
     """
     import jinja2
     from markupsafe import Markup
@@ -187,7 +192,9 @@ def write_splat_page(
         name=name,
         css=Markup((vendored / "viewer.min.css").read_text("utf-8")),
         js=Markup((vendored / "viewer.min.js").read_text("utf-8")),
+        measure=Markup((files("modp_ti.outputs.splat_page") / "measure.js").read_text("utf-8")),
         settings=settings,
+        world=world,
         map=Markup(text) if content else None,
         length=len(content),
     )

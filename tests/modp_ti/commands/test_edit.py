@@ -168,6 +168,7 @@ def test_a_map_in_metres_and_upright_shows_the_same_pictures(finished: Path, tmp
     np.testing.assert_allclose(done["factor"] * a @ R.as_matrix().T, b, atol=1e-5)
     assert R.apply([0.0, 0.0, 1.0]) @ [0.0, -1.0, 0.0] > np.cos(np.radians(15.0))  # z is up in the room
     np.testing.assert_allclose(levelled(new).R, np.eye(3), atol=1e-12)
+    assert levelled(new).scale == 1.0 != levelled(old).scale  # in the page too
     for name in ("near", "scene_depth"):
         assert getattr(new.record, name) == pytest.approx(done["factor"] * getattr(old.record, name))
     pictures = []

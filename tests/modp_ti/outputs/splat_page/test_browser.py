@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -15,17 +17,21 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from fields.geometry.camera import PinholeCamera
+from fields.map.gaussians import SH_C0
 from modp_ti.outputs.playback.camera_paths import looking_at
 from modp_ti.outputs.playback.export_map import ExportOptions, export_map
 from modp_ti.outputs.playback.finished_run import FinishedRun, open_run
 from modp_ti.outputs.playback.map_renderer import MapRenderer
 from modp_ti.outputs.progress import ProgressLine
-from modp_ti.outputs.splat_page.page import TO_VIEWER, level, moved, viewer_settings
+from modp_ti.outputs.splat_page.page import TO_VIEWER, level, moved, viewer_settings, write_splat_page
 from pipelines.whole.hierarchy import LEVELS
 from tests import chromium
+from tests.modp_ti.outputs.splat_page.test_page import finished as recorded
 from tests.patience import PATIENCE
+from tests.room import Room, look_at
 
 if chromium.missing():
     pytest.skip(chromium.missing(), allow_module_level=True)
@@ -36,6 +42,7 @@ WIDTH, HEIGHT = 320, 240
 EYE = "() => { const p = viewer.app.root.findByName('camera').getPosition(); return [p.x, p.y, p.z]; }"
 
 
+HIDE_CONTROLS = "() => { document.querySelector('.sse-ui').style.display = 'none'; }"
 SHOWN = "() => Boolean(window.viewer && viewer.state.loaded)"
 
 
@@ -100,7 +107,7 @@ def start_views(page, run: FinishedRun) -> tuple[np.ndarray, np.ndarray]:
     """What the page shows at the start of the flight, and what our renderer shows from there."""
     eye, upright = eyes_of(run)[0], level(run.poses, run.record.scene_depth)
     page.evaluate("() => { viewer.state.animationPaused = true; viewer.seek(0); }")
-    page.evaluate("() => { document.querySelector('.sse-ui').style.display = 'none'; }")
+    page.evaluate(HIDE_CONTROLS)
     until(page, f"() => {{ const p = ({EYE})(); return Math.abs(p[0] - ({eye[0]})) < 1e-3; }}")
     page.wait_for_timeout(2000)
     shown = cv2.imdecode(np.frombuffer(page.screenshot(), np.uint8), cv2.IMREAD_COLOR)[..., ::-1].astype(np.float64)
@@ -137,6 +144,58 @@ def test_the_page_shows_the_map_and_flies_through_it_without_a_request(
         assert psnr(shown, ours) >= 25 > psnr(shown[:, ::-1], ours)
         assert not errors
         assert [url for url in requests if not url.startswith(("blob:", "data:"))] == [file.as_uri()]
+
+
+def room_of_splats(room: Room, eye: np.ndarray) -> dict[str, np.ndarray]:
+    """The room's surface around a place as opaque discs, with thin fog halfway to it."""
+    rng = np.random.default_rng(4)
+    rays = rng.normal(size=(60_000, 3))
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    colour, t, normal = room.shaded(eye, rays)
+    count, fog = len(rays), len(rays) // 20
+    t[:fog] *= 0.5
+    normal[:fog] = rays[:fog]
+    turn = Rotation.concatenate([Rotation.align_vectors(n, [0, 0, 1])[0] for n in normal])
+    sh = np.zeros((count, 4, 3), np.float32)
+    sh[:, 0] = (colour - 0.5) / SH_C0
+    return {
+        "position": (eye + t[:, None] * rays).astype(np.float32),
+        "log_scale": np.log(0.03 * t[:, None] * [1.0, 1.0, 0.02]).astype(np.float32),
+        "quaternion": turn.as_quat(scalar_first=True).astype(np.float32),
+        "opacity_logit": np.where(np.arange(count) < fog, -2.5, 3.0).astype(np.float32),
+        "sh": sh,
+    }
+
+
+def test_clicks_measure_the_true_lengths_of_a_room(tmp_path: Path, room: Room) -> None:
+    eye, ahead = np.array([0.3, -1.4, 1.4]), np.array([0.1, 2.0, 1.4])
+    run = recorded(look_at(eye, ahead)[None], np.zeros(1))
+    upright = replace(level(run.poses, run.record.scene_depth), scale=1.0)
+    settings, state = viewer_settings(run, upright), room_of_splats(room, eye)
+    world = {"unit": "m", "scale": 1.0, "deviation": 0.0, "floor": 0.0}
+    write_splat_page(tmp_path / "map.html", "room", settings, moved(state, upright.R, 1.0), world)
+    camera = run.cameras[0].resized(WIDTH, HEIGHT)
+    pixels = np.array([[105.0, 60.0], [220.0, 55.0], [230.0, 95.0]])
+    rays = camera.unproject(pixels, np.ones(3)) @ run.poses[0, :3, :3]
+    true = eye + room.cast(eye, rays)[0][:, None] * rays
+    with opened((tmp_path / "map.html").as_uri(), offline=True) as (page, errors, _):
+        page.evaluate(HIDE_CONTROLS)
+        page.click("#measure")
+        said = []
+        for pixel in pixels:
+            page.mouse.click(*pixel)
+            until(page, f"() => document.querySelectorAll('#drawing circle').length > {len(said)}")
+            said.append(page.inner_text("#measured"))
+        assert not errors
+    numbers = [dict(re.findall(r"^(.*?) (\S+) \u00b1 \S+ m\u00b2?$", text, re.MULTILINE)) for text in said]
+    assert np.linalg.norm(true[1] - true[0]) == pytest.approx(2.0, abs=0.1)
+    for name, found, expected in (
+        ("height over the floor", numbers[0], true[0, 2]),
+        ("length", numbers[1], np.linalg.norm(true[1] - true[0])),
+        ("last", numbers[2], np.linalg.norm(true[2] - true[1])),
+        ("area", numbers[2], 0.5 * np.linalg.norm(np.cross(true[1] - true[0], true[2] - true[0]))),
+    ):
+        assert float(found[name]) == pytest.approx(expected, abs=0.01)
 
 
 def test_a_browser_streams_levels_of_detail_from_a_server(
