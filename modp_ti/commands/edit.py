@@ -20,6 +20,7 @@ EXAMPLES = {
     "scale": examples(
         "modp-ti scale out/room --from 12,80@40 --to 300,85@40 --metres 2.1",
         "modp-ti scale out/room --marker tag36h11 --metres 0.16 --upright",
+        "modp-ti scale out/walk --gps   (also upright, with its place on the Earth)",
     ),
 }
 # The same names as in modp_ti.outputs.locating.markers, whose imports take seconds.
@@ -95,27 +96,38 @@ def scale(
     upright: Annotated[
         bool, typer.Option("--upright", help="turn the world so that y points down, by the map's vertical edges")
     ] = False,
+    gps: Annotated[
+        bool,
+        typer.Option("--gps", help="by GPS positions of the recording (EXIF, GPMF, NavSatFix), in metres and upright"),
+    ] = False,
+    gps_file: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="by the positions of a GPX or CSV file, instead of --gps")
+    ] = None,
+    gps_offset: Annotated[float, typer.Option(metavar="S", help="seconds to add to the times of --gps-file")] = 0.0,
     quiet: Quiet = False,
     as_json: AsJson = False,
 ) -> None:
-    """Give a finished map metres, by one length or by markers, or make it upright. OUT stays as it is."""
+    """Give a finished map metres, by one length, markers or GPS, or make it upright. OUT stays as it is."""
     with outcome(as_json) as result:
-        by_points = start is not None and end is not None
-        if (start is None) != (end is None) or (by_points and marker is not None):
-            raise InputError("--from and --to go together, or instead of both --marker")
-        if (by_points or marker is not None) != (metres is not None) or (metres is None and not upright):
-            raise InputError("scale needs --metres with --from and --to or with --marker, or --upright")
+        by_points, by_gps = start is not None and end is not None, gps or gps_file is not None
+        if (start is None) != (end is None) or by_points + (marker is not None) + by_gps > 1:
+            raise InputError("--from and --to go together, or instead of both --marker, --gps or --gps-file")
+        if (by_points or marker is not None) != (metres is not None) or not (metres or upright or by_gps):
+            raise InputError("scale needs --metres with --from and --to or with --marker, or --gps, or --upright")
         import numpy as np
 
         from modp_ti.engine.edited_run import scale_run
+        from modp_ti.inputs.positions import read_positions, recorded_positions
+        from modp_ti.outputs.locating.georeference import georeference
         from modp_ti.outputs.locating.markers import marker_scale
         from modp_ti.outputs.locating.vertical import vertical
         from modp_ti.outputs.measuring import length, point_at
+        from modp_ti.outputs.playback.run_frames import run_settings
         from modp_ti.outputs.splat_page.page import Y, levelled, turning
 
         target = _target(out, output, "scale")
         run, line = opened(out, quiet)
-        factor, R, about, said = 1.0, np.eye(3), {}, [f"written to {target}"]
+        factor, R, t, about, said = 1.0, np.eye(3), np.zeros(3), {}, [f"written to {target}"]
         if metres is not None:
             if marker is not None:
                 factor, deviation, count = marker_scale(run, marker, metres, line)
@@ -127,18 +139,22 @@ def scale(
                 factor, deviation, by = metres / measured, spread / measured, "one length"
             about |= {"unit": "m", "deviation": deviation, "by": by}
             said.append(f"{factor:.6g} m per unit by {by}, \u00b1 {100 * deviation:.2g} %")
-        if upright:
+        if upright or by_gps:
             found = vertical(run, line)
             down, tilt = found or (levelled(run).R[1], None)
-            R = turning(down, Y)
-            about |= {"down": Y.tolist(), "down_deviation": None if tilt is None else float(np.degrees(tilt))}
-            sure = (
-                "by the cameras alone, not sure"
-                if tilt is None
-                else f"by vertical edges, \u00b1 {np.degrees(tilt):.1g}"
-            )
-            said.append(f"turned by {np.degrees(np.arccos(min(down[1], 1))):.3g} degrees {sure}")
-        scale_run(out, target, factor, R, about)
+            R, tilt = turning(down, Y), None if tilt is None else float(np.degrees(tilt))
+            about |= {"down": Y.tolist(), "down_deviation": tilt}
+            if tilt is not None:
+                said.append(f"upright by vertical edges, \u00b1 {tilt:.1g} degrees")
+            elif not by_gps:
+                said.append("upright as far as the cameras were held without roll: too few vertical edges")
+            if by_gps:
+                path = run_settings(run).source.require_path()
+                own = recorded_positions(path, run.names) if gps_file is None else None
+                place = georeference(run, own or read_positions(gps_file or path, path, gps_offset), found and found[0])
+                factor, R, t, about = place.s, place.R, place.t, about | place.about
+                said.append(place.text)
+        scale_run(out, target, factor, R, about, t)
         result.text = "; ".join(said)
         result.data = {"output": str(target.absolute()), "factor": factor, **about}
 

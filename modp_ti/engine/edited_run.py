@@ -161,7 +161,7 @@ def scale_run(
     s: float,
     R: NDArray[np.float64],
     about: dict[str, Any],
-    t: NDArray[np.float64] | None = None,
+    t: NDArray[np.float64],
 ) -> None:
     """Write a new output folder with the map of a finished run moved to a point's place s R x + t.
 
@@ -173,7 +173,7 @@ def scale_run(
         s: Factor on lengths.
         R: Rotation (3, 3).
         about: What `world.json` says of the new units and axes.
-        t: Translation (3,); None for zero.
+        t: Translation (3,).
 
     Raises:
         InputError: If there is no finished run, or the folder cannot be written.
@@ -181,7 +181,6 @@ def scale_run(
     from modp_ti.files.quiet_pycolmap import pycolmap
 
     run = open_run(folder)
-    t = np.zeros(3) if t is None else t
     origin = s * R @ run.record.origin + t
     poses = run.poses.copy()
     poses[:, :3, :3], poses[:, :3, 3] = poses[:, :3, :3] @ R.T, s * poses[:, :3, 3]

@@ -290,7 +290,10 @@ def evaluate(
 
 
 def umeyama(
-    source: NDArray[np.float64], target: NDArray[np.float64], with_scale: bool = True
+    source: NDArray[np.float64],
+    target: NDArray[np.float64],
+    with_scale: bool = True,
+    weight: NDArray[np.float64] | None = None,
 ) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
     """Find the similarity that minimises |s R source + t - target|^2 [Umeyama 1991].
 
@@ -298,12 +301,14 @@ def umeyama(
         source: (N, 3) points.
         target: (N, 3) corresponding points.
         with_scale: Whether to estimate the scale; 1 otherwise.
+        weight: (N,) weights of the points; None for equal ones.
 
     Returns:
         Scale s, rotation R (3, 3) and translation t (3,).
     """
-    mean_source, mean_target = source.mean(axis=0), target.mean(axis=0)
-    a, b = source - mean_source, target - mean_target
+    mean_source, mean_target = (np.average(points, axis=0, weights=weight) for points in (source, target))
+    w = np.ones((len(source), 1)) if weight is None else np.sqrt(weight)[:, None]
+    a, b = w * (source - mean_source), w * (target - mean_target)
     U, singular, Vt = np.linalg.svd(b.T @ a)
     sign = np.array([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
     R = U @ np.diag(sign) @ Vt

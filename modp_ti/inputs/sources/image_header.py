@@ -13,7 +13,7 @@ import struct
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 from PIL import ExifTags, Image, JpegImagePlugin, TiffImagePlugin
@@ -216,9 +216,35 @@ def focal_length_35mm(path: Path) -> float | None:
     Raises:
         InputError: If the package that reads HEIC or AVIF is missing.
     """
+    value = _tags(path, ExifTags.IFD.Exif).get(ExifTags.Base.FocalLengthIn35mmFilm)
+    return float(value) if isinstance(value, int) and value > 0 else None
+
+
+def photo_position(path: Path) -> tuple[float, float, float] | None:
+    """Read latitude, longitude [degrees] and height [m] from an image file's EXIF; None if they are not all stated.
+
+    Raises:
+        InputError: As `focal_length_35mm`.
+    """
+    tags, GPS = _tags(path, ExifTags.IFD.GPSInfo), ExifTags.GPS
     try:
-        with open_file(path) as file:
-            value = open_image(file).getexif().get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.FocalLengthIn35mmFilm)
+        degrees = [
+            sum(float(part) / 60**n for n, part in enumerate(tags[angle]))
+            for angle in (GPS.GPSLatitude, GPS.GPSLongitude)
+        ]
+        south, west = tags.get(GPS.GPSLatitudeRef) == "S", tags.get(GPS.GPSLongitudeRef) == "W"
+        below = tags.get(GPS.GPSAltitudeRef) in (1, b"\1")
+        found = (-degrees[0] if south else degrees[0], -degrees[1] if west else degrees[1])
+        height = float(tags[GPS.GPSAltitude])
+        return (*found, -height if below else height) if np.isfinite([*found, height]).all() else None
     except HEADER_ERRORS:
         return None
-    return float(value) if isinstance(value, int) and value > 0 else None
+
+
+def _tags(path: Path, part: ExifTags.IFD) -> dict[int, Any]:
+    """Return the tags of a part of an image file's EXIF, none if it has none."""
+    try:
+        with open_file(path) as file:
+            return open_image(file).getexif().get_ifd(part)
+    except HEADER_ERRORS:
+        return {}

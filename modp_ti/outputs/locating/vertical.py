@@ -56,7 +56,7 @@ def edges(
     )
     start, end = (camera.unproject(ends[:, side], np.ones(len(ends))) @ T_camera_world[:3, :3] for side in (0, 1))
     normal = np.cross(start, end).astype(np.float64)
-    return np.column_stack([normal / np.linalg.norm(normal, axis=1, keepdims=True), length])
+    return np.column_stack([normal / np.linalg.norm(normal, axis=1, keepdims=True), length]).astype(np.float64)
 
 
 def common_direction(
