@@ -183,6 +183,12 @@ def export(
         float | None,
         typer.Option(min=0, help="`collision`: height of ROS's map above the floor; empty: that of the cameras"),
     ] = None,
+    georeference: Annotated[
+        bool,
+        typer.Option(
+            "--georeference", help="`splat-glb`, `mesh`: also a tileset with the place on the Earth, for Cesium"
+        ),
+    ] = False,
     device: OnDevice = "auto",
     quiet: Quiet = False,
     as_json: AsJson = False,
@@ -191,7 +197,7 @@ def export(
     with outcome(as_json) as result:
         from modp_ti.outputs.playback.export_map import ExportOptions, export_map
 
-        options = ExportOptions(voxel, texture, device, spz_version, height)
+        options = ExportOptions(voxel, texture, device, spz_version, height, georeference)
         options.require_used(format)
         run, line = opened(out, quiet)
         target = export_map(run, format, output, options, line)

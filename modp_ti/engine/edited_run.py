@@ -38,6 +38,8 @@ from pipelines.whole.cleaning import faults, harmless
 COPIED = ("trajectory.txt", "frames.json", "exposure.json", "scores.csv", "recording.yaml", "colmap", "masks", WORLD)
 # Entries of metrics.json that mark folders of this file, which another call may replace.
 EDITS = ("cleaned", "cropped", "scaled")
+# Entries of world.json that hold for one position and direction of the world only.
+ON_EARTH = ("axes", "origin", "origin_deviation", "heading_deviation")
 # Loss of held-out quality that removing faults may cost [dB].
 LOSS = 0.05
 # Frames that it is measured on, evenly spaced.
@@ -185,7 +187,8 @@ def scale_run(
     poses = run.poses.copy()
     poses[:, :3, :3], poses[:, :3, 3] = poses[:, :3, :3] @ R.T, s * poses[:, :3, 3]
     gaussians = {name: values.astype(np.float32) for name, values in moved(run.gaussians, R, s).items()}
-    world = read_world(run.folder) | about
+    # What places the world on the Earth is of the world before, unless it is given again.
+    world = {name: value for name, value in read_world(run.folder).items() if name not in ON_EARTH} | about
     record = read_json(run.folder / "frames.json", "of a finished run")
     record |= {"near": s * record["near"], "scene_depth": s * record["scene_depth"], "origin": origin.tolist()}
     with _written(run, gaussians, output, {"scaled": {"factor": s, **world}}, origin) as new:

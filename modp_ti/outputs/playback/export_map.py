@@ -32,8 +32,9 @@ from modp_ti.outputs.formats.mesh import (
 )
 from modp_ti.outputs.formats.sog import write_sog, write_sog_lod
 from modp_ti.outputs.formats.textured_mesh import painted, require_atlas, unwrapped, write_textured_mesh
+from modp_ti.outputs.formats.tileset import write_tileset
 from modp_ti.outputs.formats.usd import USD_SUFFIXES, write_usd
-from modp_ti.outputs.measuring import Ruler
+from modp_ti.outputs.measuring import Ruler, read_world
 from modp_ti.outputs.playback.film import VIDEO_SUFFIXES, film, plan_flight
 from modp_ti.outputs.playback.finished_run import FinishedRun
 from modp_ti.outputs.playback.map_renderer import MapRenderer, eight_bits, start_device
@@ -68,6 +69,7 @@ class ExportOptions:
         device: Device for rendering.
         spz_version: Version of `.spz` to write, None for the default.
         height: Height above the floor of the slice of free space [scene units], None for that of the cameras.
+        georeference: Whether a tileset that says where on the Earth the file is is written next to it.
     """
 
     voxel: float | None = None
@@ -75,6 +77,7 @@ class ExportOptions:
     device: str = "auto"
     spz_version: int | None = None
     height: float | None = None
+    georeference: bool = False
 
     def require_used(self, format: str) -> None:
         """Raise InputError if an option is given that the format ignores."""
@@ -83,6 +86,7 @@ class ExportOptions:
             "texture": (("mesh",), self.texture),
             "spz-version": (("spz",), self.spz_version),
             "height": (("collision",), self.height),
+            "georeference": (("splat-glb", "mesh"), self.georeference),
         }
         for option, (of, value) in given.items():
             if value and format not in of:
@@ -123,21 +127,32 @@ def export_map(run: FinishedRun, format: str, output: Path | None, options: Expo
     options.require_used(format)
     form = FORMATS[format]
     suffixes = (".glb",) if options.texture else form.suffixes
+    origin = read_world(run.folder).get("origin")
+    if options.georeference and origin is None:
+        raise InputError(f"{run.folder}: its place on the Earth is not known: `modp-ti scale --gps` finds it")
     listed = output is None and bool(suffixes)  # belongs to the run
     target = run.folder / (TEXTURED_NAME if options.texture else form.name) if output is None else output.expanduser()
     if suffixes and (target.is_dir() or target.suffix.lower() not in suffixes):
         raise InputError(f"{target}: name a file in {', '.join(suffixes)}, for example {form.name}")
     if target.resolve() == (run.folder / "splats.ply").resolve():
         raise InputError(f"{target}: is the map itself; name another file")
+    if options.georeference and target.suffix.lower() != ".glb":
+        raise InputError(f"{target}: --georeference is for glTF: name a .glb file (-o)")
+    tileset = target.with_suffix(".tileset.json")
+    written = [target.name, *([tileset.name] if options.georeference else [])]
     if listed:
-        refuse_foreign(run.folder, [target.name])
+        refuse_foreign(run.folder, written)
     if options.texture:
         require_atlas()
     try:
         target.absolute().parent.mkdir(parents=True, exist_ok=True)
         form.write(run, target, options, line)
+        if options.georeference and origin is not None:
+            place = np.array([origin[name] for name in ("latitude", "longitude", "height")])
+            xyz = run.gaussians["position"].astype(np.float64)
+            write_tileset(tileset, target, place, run.record.origin, np.stack([xyz.min(axis=0), xyz.max(axis=0)]))
         if listed:
-            list_files(run.folder, [target.name])
+            list_files(run.folder, written)
     except OSError as error:
         raise InputError(f"{target}: cannot be written: {error.strerror or error}; name another place") from None
     return target

@@ -200,3 +200,16 @@ def test_a_scale_that_is_not_whole_is_refused(finished: Path, tmp_path: Path, wr
     found = command("scale", finished, *wrong, "-o", tmp_path / "none")
     assert found["code"] == 2 and found["error"]
     assert not (tmp_path / "none").exists()
+
+
+def test_what_is_exported_for_the_earth_needs_a_place_on_it(finished: Path, tmp_path: Path) -> None:
+    run = shutil.copytree(finished, tmp_path / "run")
+    wanted = "export", run, "--format", "splat-glb", "--georeference"
+    assert command(*wanted)["code"] == 2
+    origin = {"latitude": 47.0, "longitude": 8.0, "height": 400.0}
+    (run / "world.json").write_text(json.dumps({"unit": "m", "down": [0, 1, 0], "origin": origin}))
+    assert command(*wanted)["code"] == 0
+    tileset = json.loads((run / "splats.tileset.json").read_text())
+    assert tileset["extras"]["origin"] == origin and (run / tileset["root"]["content"]["uri"]).is_file()
+    assert command("scale", run, "--upright", "-o", tmp_path / "turned")["code"] == 0
+    assert "origin" not in json.loads((tmp_path / "turned" / "world.json").read_text())
