@@ -84,10 +84,11 @@ class Version:
             self.run("onto", self.scene, later, "--onto", self.folder / "redkitchen")
             self.killed_and_resumed("resumed", small)
         found = sorted(self.folder.glob("*/splats.ply")) + sorted(self.folder.glob("*/trajectory.txt"))
-        return {str(file.relative_to(self.folder)): _digest(file) for file in found}
+        return {str(file.relative_to(self.folder)): digest(file) for file in found}
 
 
-def _digest(file: Path) -> str:
+def digest(file: Path) -> str:
+    """Return the digest of a file, without the comments of a header."""
     lines = (line for line in file.read_bytes().split(b"\n") if not line.startswith(b"comment"))
     return hashlib.sha256(b"\n".join(lines)).hexdigest()
 

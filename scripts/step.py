@@ -6,9 +6,11 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from fields.buffers.tiles import TILE_PIXELS, TILE_WIDTH
 from fields.frames.tracked_frame import TrackedFrame
@@ -16,6 +18,7 @@ from fields.geometry.camera import PinholeCamera
 from fields.map.gaussians import GaussianField
 from fields.map.keyframes import KeyframeStore
 from fields.runtime.backend import initialise
+from fields.runtime.compiled_kernel import CompiledKernel
 from fields.runtime.engine import ti
 from modp_ti.engine.results import peak_memory_mb
 from pipelines.optimise.adam import LearningRates
@@ -109,12 +112,39 @@ def seconds(call: Callable[[], object], wait: Callable[[], object] = ti.sync) ->
     return time.perf_counter() - start
 
 
-def milliseconds(stages: Mapping[str, Callable[[], object]], repeats: int) -> dict[str, float]:
+class _Operations(TorchDispatchMode):
+    """Counts PyTorch's operations, except for those that only allocate or make views."""
+
+    count = 0
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: tuple = (), kwargs: dict | None = None) -> Any:
+        self.count += not (func.is_view or "empty" in str(func))
+        return func(*args, **(kwargs or {}))
+
+
+def device_calls(call: Callable[[], object]) -> int:
+    """Return the number of kernels and of PyTorch's operations that a call starts from the host."""
+    launched: list[int] = []
+    launch = CompiledKernel.__call__
+
+    def counted(kernel: CompiledKernel, *arguments: Any) -> None:
+        launched.append(1)
+        launch(kernel, *arguments)
+
+    with _Operations() as operations, patch.object(CompiledKernel, "__call__", counted):
+        call()
+    return len(launched) + operations.count
+
+
+def milliseconds(
+    stages: Mapping[str, Callable[[], object]], repeats: int, wait: Callable[[], object] = ti.sync
+) -> dict[str, float]:
     """Return the median time of each stage [ms] over `repeats` passes through all stages, after one warm-up pass.
 
-    The device is synchronised after every stage. On a GPU, the sum therefore exceeds the time of an undisturbed pass.
+    The device is synchronised by `wait` after every stage. On a GPU, the sum therefore exceeds the time of an
+    undisturbed pass.
     """
-    passes = [{name: seconds(call) for name, call in stages.items()} for _ in range(repeats + 1)]
+    passes = [{name: seconds(call, wait) for name, call in stages.items()} for _ in range(repeats + 1)]
     return {name: 1e3 * float(np.median([of[name] for of in passes[1:]])) for name in stages}
 
 
@@ -148,8 +178,9 @@ def measure_step(device: str, threads: int, size: Size, repeats: int) -> dict[st
         repeats: Number of timed calls.
 
     Returns:
-        Time of each of STAGES and of a whole `step` [ms], counts of pairs, `peak_memory_mb` and `cores_had`. The last
-            is the number of cores that worked on the steps, far fewer than `threads` if the machine is busy.
+        Time of each of STAGES and of a whole `step` [ms], counts of pairs, `peak_memory_mb` and `cores_had`; `host`,
+            the time that the host takes to start a step [ms], and `calls`, the number of calls by which it does. The
+            number of cores that worked on the steps is far fewer than `threads` if the machine is busy.
     """
     on_cpu = initialise(device, threads) == "cpu"
     settings = MappingSettings()
@@ -182,7 +213,13 @@ def measure_step(device: str, threads: int, size: Size, repeats: int) -> dict[st
         rows = pairs.rows_to_numpy()
         figures["pairs visited"] = int(((rows >> 16) - (rows & 0xFFFF)).sum()) * TILE_WIDTH
     wall, busy = time.perf_counter(), time.process_time()
-    figures |= milliseconds({"step": lambda: optimiser.step(store, [0], still, pose_rate=0.0)}, repeats)
+
+    def step() -> None:
+        optimiser.step(store, [0], still, pose_rate=0.0)
+
+    figures |= milliseconds({"step": step}, repeats)
     figures["cores_had"] = (time.process_time() - busy) / (time.perf_counter() - wall)
+    figures["host"] = milliseconds({"wait": ti.sync, "host": step}, repeats, wait=lambda: None)["host"]
+    figures["calls"] = device_calls(step)
     figures["peak_memory_mb"] = peak_memory_mb()
     return figures

@@ -170,7 +170,7 @@ class ViewAlignment:
                 if known.sum() < MIN_PIXELS:
                     break
                 gains = fitted_gains(self.renderer.images.colour_to_numpy()[known], image[known], gains)
-                rgba = np.dstack([frame.rgba[..., :3], known * np.uint8(255)])
+                rgba = np.dstack([frame.rgba[..., :3], known.astype(np.uint8) * np.uint8(255)])
             self.renderer.develop(np.column_stack([np.diag(gains), np.zeros(3)]), None)
             self.loss.forward(rgba)
             self.loss.backward(SSIM_WEIGHT)

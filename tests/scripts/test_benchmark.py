@@ -15,6 +15,7 @@ import benchmark
 import numpy as np
 import pytest
 import quality
+import torch
 import versions
 from quality import Point, frontier, points_of, psnr_at, seconds_to
 from step import (
@@ -26,6 +27,7 @@ from step import (
     add_gaussians,
     arrays,
     camera_of,
+    device_calls,
     measure_step,
     noise_frame,
 )
@@ -41,10 +43,15 @@ from pipelines.render.renderer import Renderer
 SMALL = Size(96, 64, 300)
 
 
+def test_operations_are_counted_and_views_are_not() -> None:
+    values = torch.rand(8)
+    assert device_calls(lambda: torch.cumsum(torch.sort(values[2:]).values.view(3, 2), 0)) == 2
+
+
 @pytest.mark.slow
 def test_a_step_is_measured_by_stage_and_its_pairs_are_counted() -> None:
     figures = measure_step("cpu", 2, SMALL, repeats=2)
-    assert all(figures[name] > 0 for name in (*STAGES, "step", "peak_memory_mb"))
+    assert all(figures[name] > 0 for name in (*STAGES, "step", "host", "calls", "peak_memory_mb"))
 
     # Independent of the lists' rows: pixels of the tiles' rows that an alpha above the threshold touches are visited.
     initialise("cpu", 1)

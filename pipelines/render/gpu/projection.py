@@ -1,5 +1,6 @@
 """Projection on a GPU: depths are sorted on the device, and the number of visible Gaussians is known only there."""
-# pyright: reportArgumentType=false, reportIndexIssue=false, reportInvalidTypeForm=false, reportOptionalSubscript=false
+# pyright: reportArgumentType=false, reportGeneralTypeIssues=false, reportIndexIssue=false
+# pyright: reportInvalidTypeForm=false, reportOptionalSubscript=false
 
 import numpy as np
 import torch
