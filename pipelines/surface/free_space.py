@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,10 +52,17 @@ class VoxelSpace:
         return states
 
     def floor(self, below: float) -> float | None:
-        """Return the height of the largest level surface below a height, in the grid's axes; None without any."""
+        """Return the height of the lowest large level surface below a height, in the grid's axes; None without any.
+
+        It is at least half as large as the largest, which may be a table.
+        """
         top = (self.state[:, :, :-1] == SOLID) & (self.state[:, :, 1:] == FREE)
         area = top.sum(axis=(0, 1))[: max(int(below / self.voxel) - self.first[2], 0)]
-        return float(self.voxel * (self.first[2] + 0.5 + area.argmax())) if area.any() else None
+        if not area.any():
+            return None
+        both = area + np.append(area[1:], 0)  # a surface may lie between two layers
+        lowest = int(np.argmax(2 * both >= both.max()))
+        return float(self.voxel * (self.first[2] + 0.5 + lowest + area[lowest : lowest + 2].argmax()))
 
 
 def carved(
@@ -130,6 +137,19 @@ def reached(space: VoxelSpace, points: NDArray[np.float64]) -> NDArray[np.bool_]
             for k in range(len(lines) - 2, -1, -1):
                 lines[k] |= lines[k + 1] & passable[k]
     return found
+
+
+def walkable(space: VoxelSpace, points: NDArray[np.float64], floor: float) -> NDArray[np.bool_]:
+    """Return where (X, Y, Z) someone may be who walks from points (N, 3) of the world on a level floor.
+
+    It is what is not solid above the floor, in columns of voxels that are more free than solid. In these, what nobody
+    saw is taken to be free: a camera at eye height rarely sees the floor before one's feet.
+    """
+    free, solid = reached(space, points), space.state == SOLID
+    ground = int(floor / space.voxel - space.first[2]) + 1
+    columns = free[:, :, ground:].sum(axis=2) > solid[:, :, ground:].sum(axis=2)
+    open_space = ~solid & columns[:, :, None] & (np.arange(solid.shape[2]) >= ground)
+    return reached(replace(space, state=np.where(open_space, FREE, SOLID).astype(np.uint8)), points)
 
 
 def _ends(view: Placed, farthest: float) -> NDArray[np.float64]:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -42,10 +43,21 @@ from modp_ti.outputs.playback.plain_colours import with_plain_colours
 from modp_ti.outputs.playback.run_frames import kept_images, pictures
 from modp_ti.outputs.progress import ProgressLine
 from modp_ti.outputs.report.page import show_link_to_map
-from modp_ti.outputs.splat_page.page import levelled, moved, viewer_settings, write_splat_page
+from modp_ti.outputs.splat_page.page import (
+    EYE_HEIGHT,
+    levelled,
+    moved,
+    page_glb,
+    viewer_settings,
+    write_splat_page,
+)
 from pipelines.surface.depth import DepthMatcher, DepthView, joined_depth
-from pipelines.surface.free_space import carved, reached
+from pipelines.surface.free_space import VoxelSpace, carved, reached, walkable
+from pipelines.surface.fusion import Placed
 from pipelines.whole.hierarchy import Hierarchy
+
+if TYPE_CHECKING:
+    from open3d.pybind.geometry import TriangleMesh
 
 TEXTURED_NAME, PAGE = "mesh.glb", "map.html"
 # Edge of the mesh's voxels, and largest depth that is fused, both relative to the scene's depth.
@@ -57,6 +69,8 @@ SPACE_VOXEL, JUMP = 1 / 50, 0.5
 # mesh's voxels. The same of the pictures that a texture is painted from.
 SURFACE_VIEWS, LONGEST_SIDE = 300, 480
 PAINTED_VIEWS, LONGEST_PAINTED_SIDE = 100, 1024
+# The same of the views in which the page's walls are looked for, and most triangles of these.
+WALKED_VIEWS, WALKED_SIDE, WALKED_TRIANGLES = 100, 240, 10_000
 
 
 @dataclass(frozen=True)
@@ -188,11 +202,16 @@ def _spz(run: FinishedRun, target: Path, options: ExportOptions, line: ProgressL
 
 def _page(run: FinishedRun, target: Path, options: ExportOptions, line: ProgressLine) -> None:
     """Write the page, and show the link to it in the run's report if it lies next to it under its default name."""
+    upright, ruler = levelled(run), Ruler.of(run)
+    walls = _walls(run, options.device, line)
     with line.working("writing the page"):
-        upright, ruler = levelled(run), Ruler.of(run)
+        if walls is not None and ruler.unit != "m":
+            upright = replace(upright, scale=EYE_HEIGHT / (walls[2] - walls[1]))
+        floor = None if walls is None else upright.scale * walls[1]
+        world = {"unit": ruler.unit, "scale": 1.0 / upright.scale, "deviation": ruler.deviation, "floor": floor}
         state = moved(run.gaussians, upright.R, upright.scale)
-        world = {"unit": ruler.unit, "scale": 1.0 / upright.scale, "deviation": ruler.deviation, "floor": None}
-        write_splat_page(target, run.folder.absolute().name, viewer_settings(run, upright), state, world)
+        shape = None if walls is None else page_glb(walls[0], upright)
+        write_splat_page(target, run.folder.absolute().name, viewer_settings(run, upright), state, world, shape)
         if target.resolve() == (run.folder / PAGE).resolve():
             show_link_to_map(run.folder / "report.html")
 
@@ -261,22 +280,16 @@ def _mesh(run: FinishedRun, target: Path, options: ExportOptions, line: Progress
 
 def _collision(run: FinishedRun, target: Path, options: ExportOptions, line: ProgressLine) -> None:
     """Write what is free and what is solid, in axes whose z points up."""
-    depth = run.record.scene_depth
     with new_folder(target) as folder:
         views = _surface_views(run, _loaded(run, LONGEST_SIDE, options.device, line), line)
-        R = levelled(run).R
-        R_grid_world = np.stack([R[0], R[2], -R[1]])
-        places = camera_centres(run.poses)
-        way = places[run.way]
-        jumps = np.flatnonzero(np.linalg.norm(np.diff(way, axis=0), axis=1) > JUMP * depth) + 1
+        seen = [(view.camera, view.T_camera_world, view.depth) for view in views]
         with line.working("carving space"):
-            seen = [(view.camera, view.T_camera_world, view.depth) for view in views]
             try:
-                voxel = options.voxel or SPACE_VOXEL * depth
-                space = carved(seen, np.split(way, jumps), R_grid_world, voxel, FARTHEST * depth)
+                space = _carved(run, seen, options.voxel)
             except ValueError as error:
                 raise InputError(f"{error}; use larger ones (--voxel)") from None
-        height = float(np.median(places @ R_grid_world[2]))
+        places = camera_centres(run.poses)
+        height = float(np.median(places @ space.R_grid_world[2]))
         floor = space.floor(height)
         if options.height is not None:
             if floor is None:
@@ -287,6 +300,41 @@ def _collision(run: FinishedRun, target: Path, options: ExportOptions, line: Pro
             write_ros_map(folder, space, height)
             write_octomap(folder / "voxels.bt", space)
             write_mesh(folder / "mesh.glb", boundary(space, reached(space, places)))
+
+
+def _carved(run: FinishedRun, seen: Sequence[Placed], voxel: float | None) -> VoxelSpace:
+    """Carve space with depth maps of a run. Raises ValueError if there would be too many voxels."""
+    depth, R = run.record.scene_depth, levelled(run).R
+    way = camera_centres(run.poses)[run.way]
+    jumps = np.flatnonzero(np.linalg.norm(np.diff(way, axis=0), axis=1) > JUMP * depth) + 1
+    R_grid_world = np.stack([R[0], R[2], -R[1]])
+    return carved(seen, np.split(way, jumps), R_grid_world, voxel or SPACE_VOXEL * depth, FARTHEST * depth)
+
+
+def _walls(run: FinishedRun, device: str, line: ProgressLine) -> tuple[TriangleMesh, float, float] | None:
+    """Return what bounds the way of someone who walks in the map, and the heights of the floor and the cameras.
+
+    They come from the map's own depth. Without a floor, or if the map is too large, there are none.
+    """
+    renderer, seen = _loaded(run, WALKED_SIDE, device, line), []
+    places = camera_centres(run.poses)
+    with line.working("looking for the floor and walls"):
+        for index in run.spread(WALKED_VIEWS):
+            camera, T = run.cameras[index].within(WALKED_SIDE), run.poses[index]
+            depth = renderer.view(camera, T).expected_depth(LEAST_OPACITY).astype(np.float32)
+            seen.append((camera, T, without_edges(depth)))
+        try:
+            space = _carved(run, seen, None)
+        except ValueError:
+            return None
+        up = space.R_grid_world[2]
+        height = float(np.median(places @ up))
+        floor = space.floor(height)
+        if floor is None:
+            return None
+        mesh = boundary(space, walkable(space, places, floor), WALKED_TRIANGLES)
+        heights = run.gaussians["position"].astype(np.float64) @ up
+        return mesh, float(np.median(heights[np.abs(heights - floor) <= space.voxel])), height
 
 
 def _loaded(run: FinishedRun, longest: int, device: str, line: ProgressLine) -> MapRenderer:

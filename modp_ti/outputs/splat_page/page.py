@@ -7,7 +7,9 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
-from typing import Any
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,12 +17,18 @@ from numpy.typing import NDArray
 from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import camera_centres, exp_se3, quaternion_from_matrix
 from modp_ti.files.atomic import replace_text
+from modp_ti.outputs.formats.gltf import write_mesh_glb
 from modp_ti.outputs.formats.sog import sog_bytes
 from modp_ti.outputs.measuring import read_world
 from modp_ti.outputs.playback.camera_paths import smoothed
 from modp_ti.outputs.playback.finished_run import FinishedRun
 from pipelines.render.spherical_harmonics import sh_rotation
 
+if TYPE_CHECKING:
+    from open3d.pybind.geometry import TriangleMesh
+
+# Height of the eye of someone who walks in the page [m]. It is the viewer's.
+EYE_HEIGHT = 1.5
 # The scene's depth in the page [m], unless the map is in metres.
 DEPTH = 3.0
 # Weight of the cameras' y axes in the direction of gravity. It decides where the x axes leave the pitch open.
@@ -163,6 +171,7 @@ def write_splat_page(
     settings: Mapping[str, Any],
     state: Mapping[str, NDArray] | None = None,
     world: Mapping[str, Any] | None = None,
+    walls: bytes | None = None,
 ) -> None:
     """Write a page that shows Gaussians with SuperSplat's viewer, which takes 2.1 MB.
 
@@ -175,13 +184,13 @@ def write_splat_page(
             for a page that shows the map of the `lod-meta.json` next to it, and loads what it shows from its server.
         world: What to measure in, of a page that holds its map: `unit`, `scale` in units per page unit, its relative
             `deviation`, and the `floor`'s height in the page or None. None for a page without measuring.
+        walls: What someone who walks in the map does not pass through, see `page_glb`, of a page that holds its map.
+            None for a page without walking.
     """
     import jinja2
     from markupsafe import Markup
 
     content = b"" if state is None else sog_bytes(state)
-    # Without "<", nothing in it can end the element. The padding makes whole words of four bytes.
-    text = base64.b85encode(content + bytes(-len(content) % 4)).decode("ascii").replace("<", ",")
     vendored = files("modp_ti.outputs.splat_page") / "supersplat"
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("modp_ti.outputs.splat_page", "."),
@@ -192,10 +201,24 @@ def write_splat_page(
         name=name,
         css=Markup((vendored / "viewer.min.css").read_text("utf-8")),
         js=Markup((vendored / "viewer.min.js").read_text("utf-8")),
-        measure=Markup((files("modp_ti.outputs.splat_page") / "measure.js").read_text("utf-8")),
+        tools=Markup((files("modp_ti.outputs.splat_page") / "tools.js").read_text("utf-8")),
         settings=settings,
         world=world,
-        map=Markup(text) if content else None,
+        map=Markup(_text(content)),
         length=len(content),
+        walls=Markup(_text(walls or b"")),
     )
     replace_text(path, page)
+
+
+def page_glb(mesh: TriangleMesh, upright: Levelled) -> bytes:
+    """Return an Open3D TriangleMesh of the map as GLB in the axes of the page, where the map is `upright`."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "walls.glb"
+        write_mesh_glb(path, TO_VIEWER * upright.points(np.asarray(mesh.vertices)), np.asarray(mesh.triangles))
+        return path.read_bytes()
+
+
+def _text(content: bytes) -> str:
+    """Return content in base 85. Without "<", nothing in it can end an element. It has whole words of four bytes."""
+    return base64.b85encode(content + bytes(-len(content) % 4)).decode("ascii").replace("<", ",")

@@ -11,8 +11,8 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from fields.geometry.se3 import camera_centres
-from pipelines.surface.free_space import FREE, SOLID, UNKNOWN, VoxelSpace, carved, reached
-from tests.room import Room, look_at, pinhole
+from pipelines.surface.free_space import FREE, SOLID, UNKNOWN, VoxelSpace, carved, reached, walkable
+from tests.room import HIGH, LOW, Room, look_at, pinhole
 
 VOXEL = 0.1
 TURN = np.array([[0.8, 0.6, 0.0], [-0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
@@ -112,6 +112,31 @@ def test_what_is_reached_is_one_connected_part(share: float) -> None:
 def test_the_floor_of_the_room_is_found(space: VoxelSpace) -> None:
     assert space.floor(1.3) == pytest.approx(0.0, abs=1.01 * VOXEL)
     assert space.floor(-1.0) is None
+
+
+def test_a_floor_is_below_a_larger_table() -> None:
+    state = np.full((40, 40, 30), FREE, np.uint8)
+    state[:, :, 12] = SOLID  # seen from above
+    state[:, :18, 12], state[:, :18, 5] = FREE, SOLID
+    for tilt in (0, 1):  # a floor may fill parts of two layers
+        state[: 20 * tilt, :18, 5], state[: 20 * tilt, :18, 4] = FREE, SOLID
+        space = VoxelSpace(state, VOXEL, np.array([3, -4, -2]), TURN)
+        assert space.floor(2.0) == pytest.approx(VOXEL * 3.5, abs=1.01 * VOXEL * tilt)
+
+
+def test_one_may_walk_where_the_floor_was_not_seen_but_not_out_of_the_room(room: Room, space: VoxelSpace) -> None:
+    way = camera_centres(looking_around())
+    floor = space.floor(1.3)
+    assert floor is not None
+    there = VOXEL * (np.argwhere(walkable(space, way, floor)) + space.first + 0.5) @ TURN
+    assert (np.abs(there - (LOW + HIGH) / 2) < (HIGH - LOW) / 2 + 1.2 * VOXEL)[:, :2].all()
+    below = np.stack([way[:, 0], way[:, 1], np.full(len(way), 0.3)], axis=1)
+    assert cKDTree(there).query(below)[0].max() < VOXEL
+    # Of the floor around the furniture, nearly all can be reached.
+    spots = np.stack(np.meshgrid(*(np.arange(LOW[k] + 0.3, HIGH[k] - 0.2, 0.1) for k in (0, 1)), [0.3]), axis=3)
+    open_spots = spots.reshape(-1, 3)
+    open_spots = open_spots[room.distance(open_spots) > 0.25]
+    assert (cKDTree(there).query(open_spots)[0] < VOXEL).mean() > 0.9
 
 
 def test_voxels_beyond_what_memory_holds_are_refused_before_they_are_made() -> None:

@@ -20,18 +20,31 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from fields.geometry.camera import PinholeCamera
+from fields.geometry.se3 import camera_centres
 from fields.map.gaussians import SH_C0
+from modp_ti.outputs.formats.collision import boundary
 from modp_ti.outputs.playback.camera_paths import looking_at
 from modp_ti.outputs.playback.export_map import ExportOptions, export_map
 from modp_ti.outputs.playback.finished_run import FinishedRun, open_run
 from modp_ti.outputs.playback.map_renderer import MapRenderer
 from modp_ti.outputs.progress import ProgressLine
-from modp_ti.outputs.splat_page.page import TO_VIEWER, level, moved, viewer_settings, write_splat_page
+from modp_ti.outputs.splat_page.page import (
+    EYE_HEIGHT,
+    TO_VIEWER,
+    Levelled,
+    level,
+    moved,
+    page_glb,
+    viewer_settings,
+    write_splat_page,
+)
+from pipelines.surface.free_space import carved, walkable
 from pipelines.whole.hierarchy import LEVELS
 from tests import chromium
 from tests.modp_ti.outputs.splat_page.test_page import finished as recorded
 from tests.patience import PATIENCE
-from tests.room import Room, look_at
+from tests.pipelines.surface.test_free_space import looking_around, true_views
+from tests.room import HIGH, LOW, Room, look_at
 
 if chromium.missing():
     pytest.skip(chromium.missing(), allow_module_level=True)
@@ -98,16 +111,24 @@ def until(page, condition: str) -> None:
         page.wait_for_timeout(100)
 
 
-def eyes_of(run: FinishedRun) -> np.ndarray:
-    track = viewer_settings(run, level(run.poses, run.record.scene_depth))["animTracks"][0]
+def upright_in(page, run: FinishedRun) -> Levelled:
+    """What makes the map upright, with the page's scale."""
+    scale = page.evaluate("() => document.getElementById('world') && 1 / JSON.parse(text('world')).scale")
+    found = level(run.poses, run.record.scene_depth)
+    return replace(found, scale=scale or found.scale)
+
+
+def eyes_of(page, run: FinishedRun) -> np.ndarray:
+    track = viewer_settings(run, upright_in(page, run))["animTracks"][0]
     return np.reshape(track["keyframes"]["values"]["position"], (-1, 3))
 
 
 def start_views(page, run: FinishedRun) -> tuple[np.ndarray, np.ndarray]:
     """What the page shows at the start of the flight, and what our renderer shows from there."""
-    eye, upright = eyes_of(run)[0], level(run.poses, run.record.scene_depth)
+    eye, upright = eyes_of(page, run)[0], upright_in(page, run)
     page.evaluate("() => { viewer.state.animationPaused = true; viewer.seek(0); }")
     page.evaluate(HIDE_CONTROLS)
+    page.evaluate("() => document.getElementById('measuring')?.remove()")
     until(page, f"() => {{ const p = ({EYE})(); return Math.abs(p[0] - ({eye[0]})) < 1e-3; }}")
     page.wait_for_timeout(2000)
     shown = cv2.imdecode(np.frombuffer(page.screenshot(), np.uint8), cv2.IMREAD_COLOR)[..., ::-1].astype(np.float64)
@@ -131,7 +152,7 @@ def test_the_page_shows_the_map_and_flies_through_it_without_a_request(
     run, file = exported(finished, "html", tmp_path / "map.html")
     with opened(file.as_uri(), offline=True) as (page, errors, requests):
         # The flight runs by itself, and along the trajectory.
-        eyes, places = eyes_of(run), [page.evaluate(EYE)]
+        eyes, places = eyes_of(page, run), [page.evaluate(EYE)]
         until(page, f"() => ({EYE})().some((x, i) => Math.abs(x - {places[0]}[i]) > 1e-6)")
         while len(places) < 5:
             places.append(page.evaluate(EYE))
@@ -196,6 +217,38 @@ def test_clicks_measure_the_true_lengths_of_a_room(tmp_path: Path, room: Room) -
         ("area", numbers[2], 0.5 * np.linalg.norm(np.cross(true[1] - true[0], true[2] - true[0]))),
     ):
         assert float(found[name]) == pytest.approx(expected, abs=0.01)
+
+
+def test_walking_stays_in_the_room_and_above_its_floor(tmp_path: Path, room: Room, taichi_on_the_cpu: None) -> None:
+    poses = looking_around(40)
+    run = recorded(poses, np.arange(40.0))
+    upright = replace(level(poses, run.record.scene_depth), scale=1.0)
+    R_grid_world = np.stack([upright.R[0], upright.R[2], -upright.R[1]])
+    space = carved(true_views(room, poses), [camera_centres(poses)], R_grid_world, 0.1, 10.0)
+    floor = space.floor(1.3)
+    assert floor is not None
+    shape = page_glb(boundary(space, walkable(space, camera_centres(poses), floor)), upright)
+    state = moved(room_of_splats(room, poses[0, :3, :3].T @ -poses[0, :3, 3]), upright.R, 1.0)
+    settings = viewer_settings(run, upright)
+    write_splat_page(tmp_path / "map.html", "room", settings, state, {"floor": floor}, shape)
+    places = []
+    with opened((tmp_path / "map.html").as_uri(), offline=True) as (page, errors, _):
+        page.evaluate(HIDE_CONTROLS)
+        page.click("#walk")
+        for keys in ("w", "d", "wd", "s", "a", "sa", "w", "wa"):
+            for key in keys:
+                page.keyboard.down(key)
+            for _ in range(8):
+                page.wait_for_timeout(150)
+                places.append(page.evaluate(EYE))
+            for key in keys:
+                page.keyboard.up(key)
+        assert not errors
+    eyes = TO_VIEWER * places @ upright.R  # back in the room
+    assert np.linalg.norm(np.diff(eyes, axis=0), axis=1).sum() > 10.0
+    assert ((eyes[:, :2] > LOW[:2]) & (eyes[:, :2] < HIGH[:2])).all()
+    assert room.distance(eyes).min() > 0.1  # also of furniture
+    assert np.abs(eyes[8:, 2] - EYE_HEIGHT).max() < 0.3
 
 
 def test_a_browser_streams_levels_of_detail_from_a_server(

@@ -151,3 +151,14 @@ function addMeasuring(viewer, world) {
   viewer.events.fire = (name, ...rest) => points && moves.includes(name) ? viewer.events : fire(name, ...rest);
   button.hidden = false;
 }
+
+// Lets a button start and end walking. The viewer's own is only there in maps that are wider than 5 m.
+function addWalking({ state, events }) {
+  const button = document.getElementById("walk");
+  button.addEventListener("click", () => {
+    state.cameraMode = state.cameraMode === "walk" ? "orbit" : "walk";
+    button.blur();
+  });
+  events.on("cameraMode:changed", (mode) => button.setAttribute("aria-pressed", mode === "walk"));
+  button.hidden = false;
+}
