@@ -62,7 +62,7 @@ class ImageHeader:
         alpha: Whether a PNG, WebP or TIFF file has an alpha channel.
         grey: Whether a PNG or TIFF file has one channel.
         profile: ICC profile of the colours; empty without.
-        panorama: Whether GPano in a JPEG file says that the image is equirectangular.
+        panorama: Whether GPano says that the image is equirectangular.
         is_tiff: Whether it is a TIFF file, which OpenCV turns upright by itself.
     """
 
@@ -111,7 +111,7 @@ def read_image_header(file: BinaryIO) -> ImageHeader:
             alpha=image.format in ("PNG", "WEBP", "TIFF") and image.has_transparency_data,
             grey=(is_png or is_tiff) and len(image.getbands()) == 1 and image.mode != "P",
             profile=image.info.get("icc_profile") or b"",
-            panorama=is_jpeg and bool(GPANO.search(image.info.get("xmp") or b"")),
+            panorama=bool(GPANO.search(image.info.get("xmp") or b"")),
             is_tiff=is_tiff,
         )
     except Image.DecompressionBombError:

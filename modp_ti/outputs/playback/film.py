@@ -21,6 +21,7 @@ from modp_ti.outputs.formats.compressed_splats import HALF_TURN
 from modp_ti.outputs.formats.dataset import new_folder
 from modp_ti.outputs.formats.mesh import LARGEST_STEP
 from modp_ti.outputs.formats.run_files import read_exposures
+from modp_ti.outputs.formats.spherical import mark_spherical_mp4, spherical_png
 from modp_ti.outputs.formats.trajectory import read_trajectory
 from modp_ti.outputs.playback.camera_paths import orbit, smoothed, upright
 from modp_ti.outputs.playback.finished_run import FinishedRun
@@ -63,7 +64,13 @@ def is_video(path: Path) -> bool:
     return suffix in VIDEO_SUFFIXES
 
 
-def write_pictures(folder: Path, pictures: Iterable[NDArray], encoding: Encoding = "tiff", unit: float = 1.0) -> None:
+def write_pictures(
+    folder: Path,
+    pictures: Iterable[NDArray],
+    encoding: Encoding = "tiff",
+    unit: float = 1.0,
+    spherical: bool = False,
+) -> None:
     """Write one file per picture, from 000000. The folder appears whole or not at all.
 
     Args:
@@ -72,6 +79,7 @@ def write_pictures(folder: Path, pictures: Iterable[NDArray], encoding: Encoding
         encoding: Of depths and normals: "tiff" and "exr" with float32 values, or "png" with 16 bits, 0 where unknown.
             Colours are always PNG.
         unit: Of "png": a step of the depth [scene units]. Of normals, [-1, 1] are 1 to 65535.
+        spherical: Whether colours say that they are equirectangular.
 
     Raises:
         InputError: If the files cannot be written.
@@ -80,7 +88,9 @@ def write_pictures(folder: Path, pictures: Iterable[NDArray], encoding: Encoding
         with new_folder(folder) as partial:
             for number, picture in enumerate(pictures):
                 form: Encoding = "png" if picture.dtype == np.uint8 else encoding
-                (partial / f"{number:06d}.{form}").write_bytes(_encoded(picture, form, unit))
+                data = _encoded(picture, form, unit)
+                marked = spherical and picture.dtype == np.uint8
+                (partial / f"{number:06d}.{form}").write_bytes(spherical_png(data) if marked else data)
                 if number == 0 and form == "png" and picture.ndim == 2:
                     (partial / "unit.json").write_text(f'{{"scene_units": {unit:g}}}\n')
     except OSError as error:
@@ -106,7 +116,9 @@ def _encoded(picture: NDArray, form: Encoding, unit: float) -> bytes:
     return cv2.imencode(f".{form}", picture[..., ::-1] if picture.ndim == 3 else picture)[1].tobytes()
 
 
-def write_video(path: Path, pictures: Iterable[NDArray[np.uint8]], frames_per_second: float) -> None:
+def write_video(
+    path: Path, pictures: Iterable[NDArray[np.uint8]], frames_per_second: float, spherical: bool = False
+) -> None:
     """Write a video: H.264 in .mp4, VP9 in .webm, 4:2:0 in the colours of BT.709. It appears whole or not at all.
 
     Args:
@@ -114,6 +126,7 @@ def write_video(path: Path, pictures: Iterable[NDArray[np.uint8]], frames_per_se
         pictures: (H, W, 3) uint8 RGB, at least one, all of one size. An odd last row or column is cropped, since 4:2:0
             needs even sizes; a single one is doubled.
         frames_per_second: Frame rate.
+        spherical: Whether an .mp4 says that it is equirectangular. Its index then is at the end.
 
     Raises:
         InputError: If the video cannot be written.
@@ -122,22 +135,26 @@ def write_video(path: Path, pictures: Iterable[NDArray[np.uint8]], frames_per_se
     import av.error
 
     codec, options, layout = VIDEO_SUFFIXES[path.suffix.lower()]
+    spherical = spherical and path.suffix.lower() == ".mp4"
     pictures = iter(pictures)
     first = next(pictures)
     height, width = (max(side // 2 * 2, 2) for side in first.shape[:2])
     single = [(0, side == 1) for side in first.shape]
     tagged = {"dst_colorspace": BT709, "dst_color_range": 1}  # luma from 16 to 235
     try:
-        with written_aside(path) as partial, av.open(str(partial), "w", options=layout) as file:
-            stream = file.add_stream(codec, Fraction(frames_per_second).limit_denominator(1001), options)
-            stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-            stream.color_primaries = stream.color_trc = stream.colorspace = BT709
-            stream.color_range = 1
-            for picture in chain([first], pictures):
-                even = np.pad(picture, single, mode="edge")[:height, :width]
-                frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgb24")
-                file.mux(stream.encode(frame.reformat(format="yuv420p", interpolation=UNBIASED, **tagged)))
-            file.mux(stream.encode(None))
+        with written_aside(path) as partial:
+            with av.open(str(partial), "w", options={} if spherical else layout) as file:
+                stream = file.add_stream(codec, Fraction(frames_per_second).limit_denominator(1001), options)
+                stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+                stream.color_primaries = stream.color_trc = stream.colorspace = BT709
+                stream.color_range = 1
+                for picture in chain([first], pictures):
+                    even = np.pad(picture, single, mode="edge")[:height, :width]
+                    frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgb24")
+                    file.mux(stream.encode(frame.reformat(format="yuv420p", interpolation=UNBIASED, **tagged)))
+                file.mux(stream.encode(None))
+            if spherical:
+                mark_spherical_mp4(partial)
     except (OSError, av.error.FFmpegError) as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from None
 
@@ -311,11 +328,11 @@ def film(
                 yield eight_bits(n.any(axis=2, keepdims=True) * (0.5 + 0.5 * n * HALF_TURN)) if video else n
 
     if video:
-        write_video(output, pictures(), flight.frames_per_second)
+        write_video(output, pictures(), flight.frames_per_second, flight.panorama is not None)
     else:
         # The power of ten of which 65,535 steps reach between 8 and 80 scene depths far: millimetres in a room.
         unit = 10.0 ** np.ceil(np.log10(8.0 * run.record.scene_depth / 65535))
-        write_pictures(output, pictures(), encoding or "tiff", unit)
+        write_pictures(output, pictures(), encoding or "tiff", unit, flight.panorama is not None)
 
 
 def _exposures(run: FinishedRun) -> list[NDArray[np.float64]]:

@@ -10,11 +10,13 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from PIL import Image
 
 from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import inverse_se3
+from modp_ti.inputs.sources.image_header import read_image_header
 from modp_ti.outputs.playback.camera_paths import upright
-from modp_ti.outputs.playback.film import Encoding, normals, write_pictures
+from modp_ti.outputs.playback.film import Encoding, normals, write_pictures, write_video
 from modp_ti.outputs.playback.map_renderer import MapRenderer
 from modp_ti.outputs.playback.panoramas import PanoramaRenderer
 from tests.panoramas import equirectangular_rays
@@ -153,3 +155,20 @@ def test_another_program_reads_depth_and_normals(tmp_path: Path, encoding: Encod
         np.testing.assert_allclose(read, true, atol=bound)
     if encoding == "png" and channels == 1:
         assert json.loads((tmp_path / "new" / "unit.json").read_text()) == {"scene_units": unit}
+
+
+def test_panoramas_say_that_they_are_some(tmp_path: Path) -> None:
+    picture = np.random.default_rng(0).integers(0, 255, (32, 64, 3), np.uint8)
+    write_pictures(tmp_path / "stills", [picture], spherical=True)
+    file = tmp_path / "stills" / "000000.png"
+    with file.open("rb") as opened:
+        assert read_image_header(opened).panorama
+    np.testing.assert_array_equal(np.asarray(Image.open(file)), picture)
+    assert b'FullPanoWidthPixels="64"' in Image.open(file).info["xmp"]
+    for spherical in (False, True):
+        video = tmp_path / f"{spherical}.mp4"
+        write_video(video, [picture] * 9, 30.0, spherical)
+        with av.open(str(video)) as container:
+            frames = list(container.decode(video=0))
+            assert len(frames) == 9
+            assert any("SPHERICAL" in str(each.type) for each in frames[0].side_data) == spherical
