@@ -289,6 +289,11 @@ class OptimiseSettings(StrictModel):
         description="passes over all keyframes after the last frame, at rates that decay; more if they are few",
     )
     ssim_weight: float = Field(default=0.2, ge=0, le=1, description="weight of 1 - SSIM beside L1")
+    depth_weight: float = Field(
+        default=0.05,
+        ge=0,
+        description="weight of the error of the rendered depth, where a sensor has measured that of the tracked points",
+    )
     aspect_weight: float = Field(default=1.0, ge=0, description="weight of the penalty on Gaussians longer than 10:1")
     position_rate: float = Field(default=2e-4, ge=0, description="Adam step of positions [scene depths]")
     scale_rate: float = Field(default=4e-2, ge=0, description="Adam step of log-scales")

@@ -54,9 +54,10 @@ class Room:
 
     Args:
         without: Numbers of the pieces that are not there: 2 is the high box, 3 the sphere.
+        contrast: Factor on the contrast of the textures.
     """
 
-    def __init__(self, without: Collection[int] = ()) -> None:
+    def __init__(self, without: Collection[int] = (), contrast: float = 1.0) -> None:
         import open3d as o3d  # takes seconds, which the collection of the tests would wait for
 
         self._tensor = o3d.core.Tensor
@@ -76,7 +77,7 @@ class Room:
         self._base = rng.uniform(0.35, 0.75, (len(pieces), 3))
         # Values at the corners of a periodic lattice, for each of the textures' two cell sizes.
         grey, colour = rng.uniform(-1.0, 1.0, (2, 32, 32, 32, 1)), rng.uniform(-1.0, 1.0, (2, 32, 32, 32, 3))
-        self._lattice = 0.8 * grey + 0.2 * colour
+        self._lattice = contrast * (0.8 * grey + 0.2 * colour)
 
     def cast(
         self, eye: NDArray[np.float64], rays: NDArray[np.float64]

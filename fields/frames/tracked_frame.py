@@ -130,6 +130,8 @@ class TrackedFrame:
         vignette: Fraction of the light that reaches each pixel, (H, W, 3) float32 in (0, 1], one array for all frames
             of a camera; None for no vignetting. The image is the scene times the vignette.
         held_out: Whether the frame is for evaluation only. Such a frame never touches the map.
+        depth_deviation: Standard deviation of the depths of `points`, relative to them, where a sensor has measured
+            them; None where they are triangulated.
         arrived: `time.monotonic()` when the image was received [s]; None for files that are not paced.
         views: Number of views that are taken at one time, such as the faces of a panorama. They follow one another, so
             that frames belong to one view if their indices are equal modulo `views`.
@@ -154,6 +156,7 @@ class TrackedFrame:
     mask: NDArray[np.bool_] | None = None
     vignette: NDArray[np.float32] | None = None
     held_out: bool = False
+    depth_deviation: float | None = None
     arrived: float | None = None
     views: int = 1
 
@@ -188,6 +191,7 @@ class TrackedFrame:
         name: str | None = None,
         mask: NDArray[np.bool_] | None = None,
         held_out: bool = False,
+        depth_deviation: float | None = None,
     ) -> TrackedFrame:
         """Build a frame from plain arrays, with checks for most mistakes in conventions.
 
@@ -203,6 +207,8 @@ class TrackedFrame:
             name: Name of the frame; None for `frame INDEX`.
             mask: Validity mask (H, W) bool, True at valid pixels; None if all pixels are valid.
             held_out: Whether the frame is for evaluation only.
+            depth_deviation: Standard deviation of the points' depths, relative to them, where a sensor has measured
+                them.
 
         Returns:
             The frame.
@@ -220,7 +226,18 @@ class TrackedFrame:
             raise TypeError(f"{name}: mask is {mask.dtype}, expected bool, True where the pixel is valid")
         points = _points(name, index, xyz, pixels, ids)
         _check_observations(name, points, T, camera)
-        return cls(index, timestamp, name, colours, camera, T, points, mask, held_out=held_out)
+        return cls(
+            index,
+            timestamp,
+            name,
+            colours,
+            camera,
+            T,
+            points,
+            mask,
+            held_out=held_out,
+            depth_deviation=depth_deviation,
+        )
 
     def with_camera(self, revision: CameraRevision) -> TrackedFrame:
         """Return the frame as it looks with a new camera. Points whose pixels leave the image are dropped."""

@@ -33,6 +33,7 @@ class Keyframe:
         median_depth: Median depth of the tracked points [scene units].
         error: Mean absolute error when the keyframe was last optimised, err(j) of Eq. 2.
         best_error: The least one that it has had at full size; inf before the first.
+        depth_deviation: As in `TrackedFrame`.
         pyramid: Images at halved sizes, the first at the size of `rgba`.
         vignette: Vignette as in `TrackedFrame`, at full size.
         exposure: Affine colour transform (A, b) (3, 4), image = (A colour + b) vignette; None if exposure is not
@@ -53,6 +54,7 @@ class Keyframe:
     median_depth: float
     error: float
     best_error: float = float("inf")
+    depth_deviation: float | None = None
     pyramid: tuple[ImageLevel, ...] = ()
     vignette: NDArray[np.float32] | None = None
     exposure: NDArray[np.float64] | None = None

@@ -218,6 +218,7 @@ class KeyframeStore:
             points=frame.points,
             median_depth=median_depth_of(frame.points, frame.T_camera_world, self.scene_depth),
             error=float(self.errors().mean()) if self._keyframes else 1.0,
+            depth_deviation=frame.depth_deviation,
             vignette=frame.vignette,
             exposure=self.exposure_at(frame.index),
             pyramid=self._kept(frame, levels),

@@ -38,7 +38,8 @@ VERSION = 4
 ABOUT = "about.json"
 AGAIN = "; record the session again"
 # What is written of a frame to `about.json`, and arrays of its points; arrays of a correction, and of its camera.
-PLAIN, POINTS = ("index", "timestamp", "name", "held_out", "arrived", "views"), ("xyz", "pixels", "ids")
+PLAIN = ("index", "timestamp", "name", "held_out", "depth_deviation", "arrived", "views")
+POINTS = ("xyz", "pixels", "ids")
 CORRECTION, REVISION = ("index", "T_camera_world", "ids", "xyz"), ("lookup", "covered")
 
 

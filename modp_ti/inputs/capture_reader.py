@@ -138,6 +138,7 @@ class DepthCaptureSettings(CaptureSettings):
     )
     max_points: int = Field(default=400, ge=10, description="largest number of points of a frame from its depth map")
     max_depth: float = Field(default=5.0, gt=0, description="largest depth [m] that is used")
+    depth_deviation: float = Field(default=0.02, gt=0, description="standard deviation of a depth [share of it]")
 
     def _gives_depths(
         self, recording: PosedRecording, capture: Capture, captured: Sequence[CapturedFrame], turns: Sequence[Turn]
@@ -161,7 +162,7 @@ class DepthCaptureSettings(CaptureSettings):
         if damaged:
             recording.notes.append(damaged.note(len(captured)))
         given = iter(points)
-        return recording.add_points(lambda _: next(given))
+        return recording.add_points(lambda _: next(given), self.depth_deviation)
 
 
 def _capture(reader: type[CaptureSettings], path: Path) -> Capture:

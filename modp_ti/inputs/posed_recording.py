@@ -234,9 +234,9 @@ class PosedRecording:
         self._reader.require_fitting(cameras.items())
         self.frames = frames
 
-    def add_points(self, points_of: Callable[[PosedImage], SparsePoints]) -> bool:
+    def add_points(self, points_of: Callable[[PosedImage], SparsePoints], depth_deviation: float | None = None) -> bool:
         """Give each frame the points that a function returns for it. Returns whether any frame has one."""
-        self.frames = [frame.with_points(points_of(frame)) for frame in self.frames]
+        self.frames = [frame.with_points(points_of(frame), depth_deviation) for frame in self.frames]
         return any(len(frame.points) for frame in self.frames)
 
     def triangulate(self) -> None:

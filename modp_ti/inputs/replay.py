@@ -32,15 +32,17 @@ class PosedImage:
         undistorter: Undistorter of the image; holds the camera of the delivered image.
         T_camera_world: Pose (4, 4), world to camera.
         points: Observed points, with pixels in the delivered (undistorted) image.
+        depth_deviation: Of the points, as in `TrackedFrame`.
     """
 
     name: str
     undistorter: Undistorter
     T_camera_world: NDArray[np.float64]
     points: SparsePoints = field(default_factory=SparsePoints)
+    depth_deviation: float | None = None
 
-    def with_points(self, points: SparsePoints) -> PosedImage:
-        return replace(self, points=points)
+    def with_points(self, points: SparsePoints, depth_deviation: float | None = None) -> PosedImage:
+        return replace(self, points=points, depth_deviation=depth_deviation)
 
 
 class ReplayedTracker(Tracker):
@@ -210,6 +212,7 @@ def tracked_frame(
         T_camera_world=frame.T_camera_world,
         points=points,
         held_out=is_held_out(index if place is None else place, reader.source),
+        depth_deviation=frame.depth_deviation,
         arrived=reader.images.arrived(frame.name),
         views=reader.source.panorama.count,
         **vars(picture),

@@ -16,6 +16,7 @@ from fields.runtime.compiled_kernel import AsyncReadback
 from pipelines.companions.companion import Companion
 from pipelines.companions.exposure import ExposureRefinement
 from pipelines.optimise.adam import Adam, AspectPenalty, LearningRates
+from pipelines.optimise.measured_depth import MeasuredDepthLoss
 from pipelines.optimise.poses import PoseRefinement
 from pipelines.render.formulas import LossValues
 from pipelines.render.renderer import Renderer
@@ -44,6 +45,7 @@ class MapOptimiser:
         self.renderer = renderer
         self.settings = settings
         self.loss = renderer.loss
+        self.measured = MeasuredDepthLoss(renderer.images, settings.optimise.depth_weight)
         self.aspect = AspectPenalty(gaussians)
         self.adam = Adam(gaussians)
         self.safeguards = Safeguards()
@@ -166,7 +168,9 @@ class MapOptimiser:
             self._move(view)
             values = self.compare(view, store.scene_depth, level, exact=False)
             self.loss.backward(o.ssim_weight, 1.0 / len(views))
-            self.renderer.backward()
+            measured = self.measured.backward(view, view.image(level).camera, 1.0 / len(views))
+            self.renderer.backward(with_depth=measured)
+            self.measured.clear()
             seen.append((view, values))
             begins = j == 0 or view.index in store.begins
             if pose_rate > 0 and not begins:

@@ -149,6 +149,7 @@ def with_depth_points(
     times: NDArray[np.float64],
     most: int,
     farthest: float,
+    deviation: float,
     progress: Progress | None = None,
 ) -> tuple[list[PosedImage], str]:
     """Give each frame points of the depth image that was taken nearest to it in time.
@@ -161,6 +162,7 @@ def with_depth_points(
         times: Their times (M,) [s].
         most: Largest number of points of a frame.
         farthest: Largest depth of a point [m].
+        deviation: Standard deviation of a depth, relative to it.
         progress: Called with what is done, how much of it and of how much.
 
     Returns:
@@ -185,7 +187,8 @@ def with_depth_points(
         in_sensor, _ = sampled_points(depth, undistorter, index, min(most, MOST), farthest)
         xyz = in_sensor @ T[:3, :3].T + T[:3, 3]
         ids = index * IDS_PER_FRAME + np.arange(len(xyz), dtype=np.int64)
-        result[index] = frame.with_points(projected_points(xyz, ids, frame.undistorter, frame.T_camera_world))
+        points = projected_points(xyz, ids, frame.undistorter, frame.T_camera_world)
+        result[index] = frame.with_points(points, deviation)
         if progress is not None:
             progress("reading depths", index + 1, len(frames))
     if len(damaged) > FEW * len(frames):

@@ -65,6 +65,7 @@ class BagSettings(PosesSettings):
         "known, unless `points` is set",
     )
     max_depth: float = Field(default=5.0, gt=0, description="largest depth [m] of a point of a depth image")
+    depth_deviation: float = Field(default=0.02, gt=0, description="standard deviation of such a depth [share of it]")
     max_points: int = Field(
         default=2000, ge=10, description="largest number of points of a frame that are taken from the clouds"
     )
@@ -193,7 +194,7 @@ def _add_depths(
             raise InputError(
                 f"{images.path}: no transform leads from {topic.frame!r}, the frame of {topic.name}, to {world!r}"
             )
-        limits = tracker.max_points, tracker.max_depth
+        limits = tracker.max_points, tracker.max_depth, tracker.depth_deviation
         recording.frames, note = with_depth_points(
             images.bag, topic, T_world_sensor, recording.frames, times, *limits, recording.progress
         )

@@ -23,6 +23,8 @@ from tests.samples.kinds import FRAMES, SAMPLES, SIZE, SMALL, write_sample
 KINDS = [kind for kind, sample in SAMPLES.items() if sample.is_tracker]
 # Kinds whose files hold neither points nor depths, so that so small pictures give none.
 WITHOUT_POINTS = ("nerfcapture", "euroc", "kitti")
+# Kinds whose points are those of a depth sensor.
+WITH_DEPTHS = ("record3d", "scanner_app", "polycam", "stray_scanner", "arkitscenes", "scannet", "bag_depth")
 # Their files hold coordinates as float32, which are lost far from the origin.
 NEAR_ALONE = ("transforms", "ply", "modp", *(kind for kind in KINDS if kind.startswith("bag_")))
 BY_NAMES = ("colmap_text", "colmap", "transforms", "modp")
@@ -57,6 +59,7 @@ def test_poses_cameras_points_and_images_are_those_that_were_filmed(kind: str, t
     frames = list(tracker)
     assert_frames(frames)
     assert (np.diff([frame.timestamp for frame in frames]) > 0).all()
+    assert {frame.depth_deviation is not None for frame in frames} == {kind in WITH_DEPTHS}
     for frame, posed, view in zip(frames, tracker.frames, SMALL.views, strict=True):
         np.testing.assert_allclose(posed.undistorter.raw.matrix(), view.K, atol=1e-6)
         expected = view.image[..., 1] / 255.0  # green: bags are grey
