@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from fields.geometry.se3 import inverse_se3, motion_around, moved_pose, scale_of
 from modp_ti.inputs.klt.landmark_map import Keyframe, LandmarkMap, unprojected
-from modp_ti.inputs.multiview.appearance import nearest_words, vlad
+from modp_ti.inputs.multiview.appearance import vlad, vocabulary
 from modp_ti.inputs.multiview.features import Features, epipolar_lines, essential_matrix, match_anywhere
 from modp_ti.inputs.multiview.reprojection import pose_from_points, ray_errors
 
@@ -25,7 +25,6 @@ FEWEST = 15  # fewest inlier matches of a pose
 THUMBNAIL = (32, 24)
 WORDS = 64
 TRAINED_ON = 20_000  # descriptors, at most
-ROUNDS = 12  # of k-means
 FEWEST_PLACED = 25  # matches with depth in both keyframes
 MAX_ERROR_BETWEEN = 8.0  # px, of a point of the one map in the keyframe of the other
 LEAST_SHARE = 0.6  # of the matches that must be that near
@@ -179,20 +178,6 @@ class PlaceIndex:
         if vector is None:
             vector = self._vectors[keyframe.number] = vlad(keyframe.described.descriptors, self._words)
         return vector
-
-
-def vocabulary(descriptors: NDArray[np.uint8], count: int, seed: int) -> NDArray[np.float32]:
-    """Cluster centres (count, 128) of descriptors (N, 128), rounded to integers; fewer if there are few descriptors."""
-    count = min(count, len(descriptors))
-    if count == 0:
-        return np.zeros((0, 128), np.float32)
-    data = descriptors.astype(np.float32)
-    start = data[np.random.default_rng(seed).choice(len(data), count, replace=False)]
-    labels = nearest_words(data, start).astype(np.int32)
-    # With initial labels and one attempt, the result does not depend on OpenCV's own random numbers.
-    criteria = (cv2.TERM_CRITERIA_MAX_ITER, ROUNDS, 0.0)
-    _, _, centres = cv2.kmeans(data, count, labels, criteria, 1, cv2.KMEANS_USE_INITIAL_LABELS)
-    return np.rint(np.asarray(centres, np.float32))
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from modp_ti.inputs.multiview.features import Features
 # same views.
 WORDS = 32
 TRAINED_WITH = 20_000
-ITERATIONS = 15
+ROUNDS = 12  # of k-means
 # Up to this number of images, all pairs are matched.
 ALL_PAIRS = 60
 # Images that look most like an image, which are matched with it: beside its neighbours in a sequence, where they close
@@ -34,9 +34,9 @@ class Appearance:
     """
 
     def __init__(self, features: Sequence[Features], seed: int = 0) -> None:
-        described = np.concatenate([image.descriptors for image in features]).astype(np.float32)
+        described = np.concatenate([image.descriptors for image in features])
         chosen = np.random.default_rng(seed).permutation(len(described))[:TRAINED_WITH]
-        self._words = _clustered(described[np.sort(chosen)], seed)
+        self._words = vocabulary(described[np.sort(chosen)], WORDS, seed)
         self._vectors = np.stack([vlad(image.descriptors, self._words) for image in features])
 
     def alike(self, features: Features, count: int) -> list[int]:
@@ -49,16 +49,18 @@ class Appearance:
         return self._vectors @ self._vectors.T
 
 
-def _clustered(described: NDArray[np.float32], seed: int) -> NDArray[np.float32]:
-    """At most `WORDS` centres (K, 128) of the descriptors by k-means."""
-    count = min(WORDS, len(described))
+def vocabulary(descriptors: NDArray[np.uint8], count: int, seed: int) -> NDArray[np.float32]:
+    """Cluster centres (count, 128) of descriptors (N, 128), rounded to integers; fewer if there are few descriptors."""
+    count = min(count, len(descriptors))
     if count == 0:
-        return np.zeros((1, 128), np.float32)
-    cv2.setRNGSeed(seed)
-    criteria = (cv2.TERM_CRITERIA_MAX_ITER, ITERATIONS, 0.0)
-    _, _, centres = cv2.kmeans(described, count, np.zeros((0, 1), np.int32), criteria, 1, cv2.KMEANS_PP_CENTERS)
-    # Rounded, since the threads of k-means may sum in another order.
-    return np.round(np.asarray(centres, np.float32))
+        return np.zeros((0, 128), np.float32)
+    data = descriptors.astype(np.float32)
+    start = data[np.random.default_rng(seed).choice(len(data), count, replace=False)]
+    labels = nearest_words(data, start).astype(np.int32)
+    # With initial labels and one attempt, the result does not depend on OpenCV's own random numbers.
+    criteria = (cv2.TERM_CRITERIA_MAX_ITER, ROUNDS, 0.0)
+    _, _, centres = cv2.kmeans(data, count, labels, criteria, 1, cv2.KMEANS_USE_INITIAL_LABELS)
+    return np.rint(np.asarray(centres, np.float32))
 
 
 def image_pairs(

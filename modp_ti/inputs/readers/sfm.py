@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 # The fingerprint of what a kept model was made of. A change of the method must change METHOD.
 MADE_OF = "made_of.txt"
-METHOD = "2"
+METHOD = "3"
 
 
 class SfmSettings(TrackerSettings):
