@@ -21,11 +21,6 @@ from modp_ti.inputs.multiview.reprojection import (
 
 MAX_ERROR = 2.0  # largest reprojection error [px of the image used for detection]
 
-# For tracked corners: points with less parallax [degrees] are used only where a frame would otherwise have fewer than
-# ENOUGH points.
-SURE_ANGLE = 4.0
-ENOUGH = 50
-
 # Two views agree on any match along the epipolar line, so a third one must confirm a point. On a real sequence, one in
 # ten points of two views was off by more than 6 % in depth, and one in a hundred with more views.
 MIN_VIEWS = 3
@@ -102,33 +97,6 @@ def placed_anew(
         error = point_errors(poses, used, places)
         costs.append(np.bincount(used.point, weights=np.log1p(error**2), minlength=len(xyz)))
     return np.where((costs[1] < costs[0])[:, None], moved, xyz)
-
-
-def surest_points(
-    poses: NDArray[np.float64], seen: Observations, xyz: NDArray[np.float64], solves: NDArray[np.bool_]
-) -> tuple[NDArray[np.float64], Observations]:
-    """Select points with a parallax of at least SURE_ANGLE, and others where a solving frame has fewer than ENOUGH.
-
-    With less parallax, errors of the given poses cause larger errors in depth.
-
-    Args:
-        poses: (F, 4, 4) T_camera_world.
-        seen: Observations.
-        xyz: (P, 3) positions.
-        solves: (F,) False for held-out frames, whose rays and numbers of points do not count.
-
-    Returns:
-        The selected positions and their observations.
-    """
-    angle = _widest_angle(poses, seen.where(solves[seen.frame]), xyz)
-    kept = angle >= SURE_ANGLE
-    have = np.bincount(seen.frame[kept[seen.point]], minlength=len(poses))
-    unsure = seen.where(~kept[seen.point] & solves[seen.frame])
-    unsure = unsure.where(np.lexsort((unsure.point, -angle[unsure.point], unsure.frame)))
-    first = np.searchsorted(unsure.frame, unsure.frame)
-    kept[unsure.point[have[unsure.frame] + np.arange(len(unsure)) - first < ENOUGH]] = True
-    seen = seen.where(kept[seen.point])
-    return xyz[kept], Observations(seen.frame, (np.cumsum(kept) - 1)[seen.point], seen.rays, seen.sigma)
 
 
 def _nearest_to_rays(poses: NDArray[np.float64], seen: Observations, count: int) -> NDArray[np.float64]:

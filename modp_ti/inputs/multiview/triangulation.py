@@ -18,7 +18,7 @@ from modp_ti.inputs.multiview.features import (
     match_features,
 )
 from modp_ti.inputs.multiview.followed_features import EPIPOLAR_BAND, follow_features, looks_like_video
-from modp_ti.inputs.multiview.points_and_poses import adjusted_poses, solve_points, surest_points
+from modp_ti.inputs.multiview.points_and_poses import adjusted_poses, solve_points
 from modp_ti.inputs.multiview.reprojection import Observations, point_errors
 from modp_ti.inputs.protocol import Progress
 from modp_ti.inputs.replay import PosedImage, points_inside
@@ -171,8 +171,6 @@ class _Sequence:
     def with_points(self, poses: NDArray[np.float64], seen: Observations) -> list[PosedImage]:
         """Triangulate the observations with these poses, and give each frame its pose and points."""
         xyz, seen = solve_points(poses, seen, self._solves)
-        if self.follows:
-            xyz, seen = surest_points(poses, seen, xyz, self._solves)
         result = []
         for i, (frame, T) in enumerate(zip(self._frames, poses, strict=True)):
             mine = seen.where(seen.frame == i)

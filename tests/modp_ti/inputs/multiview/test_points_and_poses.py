@@ -8,11 +8,9 @@ from scipy.spatial.transform import Rotation
 
 from fields.geometry.se3 import camera_centres
 from modp_ti.inputs.multiview.points_and_poses import (
-    ENOUGH,
     adjusted_poses,
     placed_anew,
     solve_points,
-    surest_points,
 )
 from modp_ti.inputs.multiview.reprojection import Observations
 
@@ -95,28 +93,6 @@ def test_views_that_do_not_solve_are_only_told_what_they_see(poses, points):
     moved = placed_anew(poses, few, start, solves)
     assert np.array_equal(moved[:10], start[:10])
     np.testing.assert_allclose(moved[10:], points[10:], atol=1e-6)
-
-
-def test_what_a_held_out_frame_sees_does_not_choose_the_points_of_others() -> None:
-    """A held-out frame that sees less than ENOUGH sure points gets no unsure ones, which others would get as well."""
-    rng = np.random.default_rng(0)
-    poses = np.tile(np.eye(4), (4, 1, 1))
-    poses[:, 0, 3] = [0.0, 0.1, 0.2, 0.05]
-    solves = np.array([True, True, True, False])
-    near, far = 2 * ENOUGH, 30  # 5.7 and 0.6 degrees of parallax
-    xyz = np.c_[rng.uniform(-0.5, 0.5, (near + far, 2)), np.repeat([2.0, 20.0], [near, far])]
-
-    def seen(held_out: list[int]) -> Observations:
-        """Everything in the three solving frames, and some of it in the held-out one."""
-        point = np.concatenate([np.tile(np.arange(len(xyz)), 3), held_out]).astype(np.int64)
-        frame = np.repeat([0, 1, 2, 3], [len(xyz)] * 3 + [len(held_out)])
-        local = xyz[point] + poses[frame, :3, 3]
-        return Observations(frame, point, local[:, :2] / local[:, 2:], np.full(len(point), 1e-3))
-
-    alone, _ = surest_points(poses, seen([]), xyz, solves)
-    beside, _ = surest_points(poses, seen([0, 1, near, near + 1]), xyz, solves)
-    assert len(alone) == near
-    assert np.array_equal(alone, beside)
 
 
 def rigid(turn: np.ndarray, shift: np.ndarray) -> np.ndarray:
