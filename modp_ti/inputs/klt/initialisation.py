@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modp_ti.inputs.klt.camera import Lens
-from modp_ti.inputs.klt.frame import WANTED, Frame
 from modp_ti.inputs.klt.landmark_map import LandmarkMap, triangulated
+from modp_ti.inputs.multiview.frame import WANTED, Frame
 from modp_ti.inputs.multiview.reprojection import estimated, pose_from_points, ray_errors
 
 FEWEST_SHARED = 60  # features that two views must share

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from fields.geometry.se3 import inverse_se3, moved_points, moved_pose, scale_of
 from modp_ti.inputs.klt.camera import Lens
-from modp_ti.inputs.klt.frame import Frame, LocalisedFrame
 from modp_ti.inputs.multiview.bundle_adjustment import Refinable, adjusted_apart, adjusted_bundle
 from modp_ti.inputs.multiview.features import Features
+from modp_ti.inputs.multiview.frame import Frame, LocalisedFrame
 from modp_ti.inputs.multiview.reprojection import ray_errors
 
 # Observations with a larger reprojection error [px] are outliers.

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.geometry.se3 import inverse_se3
-from modp_ti.inputs.klt.frame import BORDER, Frame, LocalisedFrame
 from modp_ti.inputs.klt.landmark_map import LandmarkMap, unprojected
+from modp_ti.inputs.multiview.frame import BORDER, Frame, LocalisedFrame
 from modp_ti.inputs.multiview.reprojection import pose_from_points, ray_errors, refine_pose
 
 MAX_ERROR = 3.0  # landmarks with a larger reprojection error [px] are no longer tracked

@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from modp_ti.inputs.klt.camera import CameraRefinement, Lens
-from modp_ti.inputs.klt.frame import Frame
 from modp_ti.inputs.klt.initialisation import Initialisation
 from modp_ti.inputs.klt.loop_closing import LoopClosing
 from modp_ti.inputs.klt.map_joining import MapJoining, connected, joint_similarity
 from modp_ti.inputs.klt.tracking import Tracking, View
+from modp_ti.inputs.multiview.frame import Frame
 
 # Keyframes or frames from which the frames of the first map are delivered. A map that is lost before is that of a bad
 # start.

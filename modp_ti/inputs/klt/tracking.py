@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from fields.geometry.se3 import inverse_se3, orthonormalised, scale_of
 from modp_ti.inputs.klt.camera import CameraRefinement
-from modp_ti.inputs.klt.frame import Frame, LocalisedFrame
 from modp_ti.inputs.klt.landmark_map import LandmarkMap
 from modp_ti.inputs.klt.localisation import FEWEST, SIGMA, localised, predicted_pixels, realigned, searched
 from modp_ti.inputs.klt.recognition import inherited, place_by_features, thumbnail, world_points
 from modp_ti.inputs.multiview.bundle_adjustment import Refinable
 from modp_ti.inputs.multiview.features import match_anywhere
+from modp_ti.inputs.multiview.frame import Frame, LocalisedFrame
 from modp_ti.inputs.multiview.reprojection import refine_pose
 
 # A frame becomes a keyframe if the features have moved by KEYFRAME_SHIFT of the image's longer side since the last

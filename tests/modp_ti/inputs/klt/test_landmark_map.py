@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from fields.geometry.camera import PinholeCamera
 from fields.geometry.se3 import exp_se3, inverse_se3, moved_points, moved_pose, scale_of
 from modp_ti.inputs.klt.camera import Lens
-from modp_ti.inputs.klt.frame import Frame, corners, flow
 from modp_ti.inputs.klt.initialisation import two_views
 from modp_ti.inputs.klt.landmark_map import LandmarkMap, triangulated
 from modp_ti.inputs.klt.localisation import align_landmarks, reference_views
 from modp_ti.inputs.klt.loop_closing import carry_over
 from modp_ti.inputs.klt.recognition import PlaceIndex, Recognition, agreeing, recognised
+from modp_ti.inputs.multiview.frame import Frame, corners, flow
 from modp_ti.inputs.multiview.reprojection import pose_from_points, ray_errors, refine_pose
 from tests.room import look_at
 
