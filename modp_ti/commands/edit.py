@@ -94,7 +94,10 @@ def scale(
         float | None, typer.Option(min=1e-6, help="the length between the two points, or of a marker's black edge")
     ] = None,
     upright: Annotated[
-        bool, typer.Option("--upright", help="turn the world so that y points down, by the map's vertical edges")
+        bool,
+        typer.Option(
+            "--upright", help="turn the world so that y points down, by a video's gravity or by vertical edges"
+        ),
     ] = False,
     gps: Annotated[
         bool,
@@ -141,17 +144,19 @@ def scale(
             said.append(f"{factor:.6g} m per unit by {by}, \u00b1 {100 * deviation:.2g} %")
         if upright or by_gps:
             found = vertical(run, line)
-            down, tilt = found or (levelled(run).R[1], None)
-            R, tilt = turning(down, Y), None if tilt is None else float(np.degrees(tilt))
+            R = turning(levelled(run).R[1] if found is None else found.down, Y)
+            tilt = None if found is None else float(np.degrees(found.deviation))
             about |= {"down": Y.tolist(), "down_deviation": tilt}
-            if tilt is not None:
-                said.append(f"upright by vertical edges, \u00b1 {tilt:.1g} degrees")
+            if found is not None:
+                said.append(f"upright by {found.by}, \u00b1 {tilt:.1g} degrees")
             elif not by_gps:
                 said.append("upright as far as the cameras were held without roll: too few vertical edges")
             if by_gps:
                 path = run_settings(run).source.require_path()
                 own = recorded_positions(path, run.names) if gps_file is None else None
-                place = georeference(run, own or read_positions(gps_file or path, path, gps_offset), found and found[0])
+                place = georeference(
+                    run, own or read_positions(gps_file or path, path, gps_offset), found and found.down
+                )
                 factor, R, t, about = place.s, place.R, place.t, about | place.about
                 said.append(place.text)
         scale_run(out, target, factor, R, about, t)

@@ -1,4 +1,4 @@
-"""GPS positions of a recording: in its photographs (EXIF), video (GPMF of GoPro) or bag (NavSatFix), or in a file.
+"""GPS positions of a recording, in its photographs (EXIF), video (GPMF) or bag, or in a file; and a video's gravity.
 
 GPMF is nested records of big-endian numbers, each padded to four bytes:
 
@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from fields.geometry.se3 import matrices_from_unit_quaternions
 from modp_ti.files.errors import InputError
 from modp_ti.files.reading import read_bytes, read_text, reading
 from modp_ti.inputs.bags.bag import Bag, is_bag
@@ -29,7 +30,11 @@ from modp_ti.inputs.sources.image_header import photo_position
 from modp_ti.inputs.sources.video_file import CONTAINERS
 
 # Streams of GPMF with the columns of latitude, longitude and height: up to HERO10, from HERO11 on, of drones.
-STREAMS = {b"GPS5": (0, 1, 2), b"GPS9": (0, 1, 2), b"GLPI": (1, 2, 3)}
+FIXES = {b"GPS5": (0, 1, 2), b"GPS9": (0, 1, 2), b"GLPI": (1, 2, 3)}
+# Gravity in the axes of the camera, and the rotation (w, x, y, z) from these to the image's, which stabilisation turns.
+# Both axes are OpenCV's: so the images and gyroscope of a GoPro Max agree to 1.3 degrees, in any other way less.
+GRAVITY, TURN = b"GRAV", b"IORI"
+STREAMS = {**FIXES, GRAVITY: (0, 1, 2), TURN: (0, 1, 2, 3)}
 FIX = 8  # column of GPS9 with the dimensions of the fix
 NUMBERS = dict(zip("bBsSlLjJfd", ("i1", "u1", ">i2", ">u2", ">i4", ">u4", ">i8", ">u8", ">f4", ">f8"), strict=True))
 NAV_SAT_FIX = "sensor_msgs/msg/NavSatFix"
@@ -74,11 +79,26 @@ def recorded_positions(path: Path, names: Sequence[str]) -> Positions:
                 return Positions(np.array([*there.values()]), names=[*there])
             rows = []
         else:
-            rows = [row for packet in _packets(path) for row in _samples(*packet)]
+            rows = [row for key, row in _telemetry(path) if key in FIXES]
     if not rows:
         raise InputError(f"{path}: holds no GPS positions; give a GPX or CSV file (--gps-file)")
     table = np.array(rows)
     return Positions(table[:, 1:], table[:, 0])
+
+
+def recorded_gravity(path: Path, times: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """Return the direction of gravity (F, 3) in the images of a video at times (F,) [s]; None if it holds none."""
+    with reading(path):
+        samples = [*_telemetry(path)] if path.is_file() and not is_bag(path) else []
+    gravity, turn = (np.array([row for key, row in samples if key == wanted]) for wanted in (GRAVITY, TURN))
+    if len(gravity) == 0 or not gravity[:, 1:].any() or not gravity[0, 0] <= times.max() <= gravity[-1, 0] + 1.0:
+        return None
+    g = np.stack([np.interp(times, gravity[:, 0], column) for column in gravity[:, 1:].T], axis=1)
+    if len(turn):
+        q = np.stack([np.interp(times, turn[:, 0], column) for column in turn[:, 1:].T], axis=1)
+        R = matrices_from_unit_quaternions(q / np.linalg.norm(q, axis=1, keepdims=True))
+        g = np.einsum("nij,nj->ni", R, g)
+    return g / np.linalg.norm(g, axis=1, keepdims=True)
 
 
 def read_positions(path: Path, recording: Path, offset: float = 0.0) -> Positions:
@@ -155,15 +175,17 @@ def _began(video: Path) -> float:
     return _since_1970(stated)
 
 
-def _packets(video: Path) -> Iterator[tuple[bytes, float, float]]:
-    """Yield the packets of GPMF in a video, with their time and duration [s]."""
+def _telemetry(video: Path) -> Iterator[tuple[bytes, tuple[float, ...]]]:
+    """Yield key, and time [s] and values of the samples of GPMF in a video."""
     import av
 
     options = {"format_whitelist": CONTAINERS, "protocol_whitelist": "file"}
     with av.open(f"file:{video}", options=options, metadata_errors="replace") as container:
         for packet in container.demux(container.streams.data):
             if packet.pts is not None and packet.time_base and (data := bytes(packet))[:4] == b"DEVC":
-                yield data, float(packet.pts * packet.time_base), float((packet.duration or 0) * packet.time_base)
+                yield from _samples(
+                    data, float(packet.pts * packet.time_base), float((packet.duration or 0) * packet.time_base)
+                )
 
 
 def _records(data: bytes) -> Iterator[tuple[bytes, bytes, int, int, bytes]]:
@@ -175,8 +197,8 @@ def _records(data: bytes) -> Iterator[tuple[bytes, bytes, int, int, bytes]]:
         at += 8 + -(-size * count // 4) * 4
 
 
-def _samples(data: bytes, time: float, duration: float) -> Iterator[tuple[float, ...]]:
-    """Yield time, latitude, longitude and height of the fixes in a packet."""
+def _samples(data: bytes, time: float, duration: float) -> Iterator[tuple[bytes, tuple[float, ...]]]:
+    """Yield key, and time and values of the samples in a packet."""
     scale, types, fix = np.ones(1), "", 3
     for key, kind, size, count, content in _records(data):
         if kind == b"\0":
@@ -191,6 +213,6 @@ def _samples(data: bytes, time: float, duration: float) -> Iterator[tuple[float,
             letters = types or kind.decode() * (size // np.dtype(NUMBERS[kind.decode()]).itemsize)
             columns = np.frombuffer(content, [(str(n), NUMBERS[letter]) for n, letter in enumerate(letters)], count)
             for i, row in enumerate(columns.tolist()):
-                if (row[FIX] if key == b"GPS9" else fix) >= 2:
-                    latitude, longitude, height = (row[n] / scale[n % len(scale)] for n in STREAMS[key])
-                    yield time + i / count * duration, latitude, longitude, height
+                if key not in FIXES or (row[FIX] if key == b"GPS9" else fix) >= 2:
+                    values = (row[n] / scale[n % len(scale)] for n in STREAMS[key])
+                    yield key, (time + i / count * duration, *values)

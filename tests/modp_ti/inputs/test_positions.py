@@ -11,9 +11,10 @@ import av
 import numpy as np
 import pytest
 from PIL import ExifTags, Image
+from scipy.spatial.transform import Rotation
 
 from modp_ti.files.errors import InputError
-from modp_ti.inputs.positions import read_positions, recorded_positions
+from modp_ti.inputs.positions import read_positions, recorded_gravity, recorded_positions
 from tests.samples.bags import Messages, write_bag
 
 PLACES = np.array([[47.5, -8.25, 431.5], [-0.125, 8.5, -3.0]])
@@ -82,6 +83,17 @@ def record(key: str, kind: str, size: int, content: bytes) -> bytes:
     return head + content + bytes(-len(content) % 4)
 
 
+def write_track(video: Path, packets: list[bytes]) -> None:
+    """A video file with a track of telemetry, in packets of 0.9 s."""
+    with av.open(str(video), "w") as container:
+        track = container.add_data_stream("bin_data")
+        for number, data in enumerate(packets):
+            packet = av.Packet(data)
+            packet.stream, packet.time_base, packet.duration = track, Fraction(1, 1000), 900
+            packet.pts = packet.dts = 900 * number
+            container.mux(packet)
+
+
 def test_fixes_of_a_video_are_those_with_two_dimensions_or_more(tmp_path: Path) -> None:
     columns, scale = "lllllllSS", (10**7, 10**7, 1000, 1000, 100, 1, 1000, 100, 1)
     rows = [(*(np.array(place) * scale[:3]).round().astype(int), 0, 0, 1, 2, 3, 3) for place in PLACES]
@@ -89,20 +101,31 @@ def test_fixes_of_a_video_are_those_with_two_dimensions_or_more(tmp_path: Path) 
     stream = record("SCAL", "l", 4, struct.pack(">9l", *scale)) + record("TYPE", "c", 1, columns.encode())
     stream += record("GPS9", "?", 32, b"".join(struct.pack(">7l2H", *row) for row in rows))
     packet = record("DEVC", "", 1, record("DVNM", "c", 1, b"camera") + record("STRM", "", 1, stream))
-    for video, data in (("whole.mp4", packet), ("cut.mp4", packet[:-90])):
-        with av.open(str(tmp_path / video), "w") as container:
-            track = container.add_data_stream("bin_data")
-            for second in (0, 1):
-                part = av.Packet(data)
-                part.stream, part.time_base = track, Fraction(1, 1000)
-                part.pts = part.dts = 900 * second
-                part.duration = 900
-                container.mux(part)
+    write_track(tmp_path / "whole.mp4", [packet, packet])
+    write_track(tmp_path / "cut.mp4", [packet[:-90]])
     found = recorded_positions(tmp_path / "whole.mp4", [])
     np.testing.assert_allclose(found.geodetic, np.tile(PLACES, (2, 1)), atol=1e-6)
     np.testing.assert_allclose(found.times, [0.0, 0.6, 0.9, 1.5], atol=1e-3)
     with pytest.raises(InputError):
         recorded_positions(tmp_path / "cut.mp4", [])
+
+
+def test_gravity_of_a_video_is_that_of_its_stabilised_pictures(tmp_path: Path) -> None:
+    rolls, times = np.radians([20.0, -10.0, 0.0]), np.array([0.0, 0.3, 0.6])
+    down = np.stack([np.sin(rolls), np.cos(rolls), 0.0 * rolls], axis=1)  # of a camera that rolls
+    turns = Rotation.from_rotvec(rolls[:, None] * [0.0, 0.0, 1.0])  # and whose pictures are turned back
+    scale = record("SCAL", "s", 2, struct.pack(">h", 32767))
+    gravity, turn = (
+        scale + record(key, "s", 2 * values.shape[1], (32767 * values).round().astype(">i2").tobytes())
+        for key, values in (("GRAV", down), ("IORI", turns.as_quat()[:, [3, 0, 1, 2]]))
+    )
+    for streams, expected in (([gravity], down), ([gravity, turn], np.tile([0.0, 1.0, 0.0], (3, 1)))):
+        packet = record("DEVC", "", 1, b"".join(record("STRM", "", 1, stream) for stream in streams))
+        write_track(tmp_path / "a.mp4", [packet])
+        found = recorded_gravity(tmp_path / "a.mp4", times)
+        assert found is not None
+        np.testing.assert_allclose(found, expected, atol=1e-3)
+        assert recorded_gravity(tmp_path / "a.mp4", times + 5.0) is None
 
 
 def test_the_videos_of_a_camera_and_a_drone_have_their_ways(shared_data: Callable[[str], Path]) -> None:

@@ -1,4 +1,4 @@
-"""Down by vertical edges: of pictures of the room in worlds turned by chance, and of edges by chance."""
+"""Down by vertical edges in pictures of the room in worlds turned by chance, and by directions in cameras."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from modp_ti.outputs.locating.vertical import common_direction, edges
+from modp_ti.outputs.locating.vertical import common_direction, edges, mean_direction
 from tests.room import Room, pinhole, walk
 
 CAMERA = pinhole(320, 240)
@@ -35,3 +35,16 @@ def test_edges_of_all_directions_tell_nothing() -> None:
     views = [np.column_stack([normal, rng.uniform(10, 50, 200)]) for normal in normals]
     assert common_direction(views, np.array([0.0, 1.0, 0.0])) is None
     assert common_direction([np.zeros((0, 4))] * 3, np.array([0.0, 1.0, 0.0])) is None
+
+
+def test_the_mean_of_a_direction_in_many_cameras_and_its_deviation() -> None:
+    rng, down = np.random.default_rng(7), np.array([0.0, 0.6, 0.8])
+    errors = []
+    for seed in range(40):
+        R = Rotation.random(200, random_state=seed).as_matrix()
+        poses = np.tile(np.eye(4), (200, 1, 1))
+        poses[:, :3, :3] = R
+        mean, deviation = mean_direction(poses, R @ down + rng.normal(0.0, 0.02, (200, 3)), down) or (down, 0.0)
+        errors.append(np.linalg.norm(mean - down) / deviation)
+    assert 0.5 < np.sqrt(np.mean(np.square(errors))) < 1.5
+    assert mean_direction(poses, -R @ down, down) is None  # pictures that were turned
