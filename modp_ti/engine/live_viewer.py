@@ -22,6 +22,7 @@ from modp_ti.outputs.viewer.modes import SPLATS, Photograph, painter, splats_of
 from modp_ti.outputs.viewer.page import Page, ShownFrame
 from pipelines.pipeline import FrameReport
 from pipelines.render.renderer import RenderedView
+from pipelines.whole.coverage import SIDE, SeenDepth
 
 # Fraction of the allowed cost that is budgeted. The rest covers what is not measured: contention for the GIL and for
 # the caches between the viewer's threads and the mapper.
@@ -32,6 +33,8 @@ FOR_NUMBERS = 0.25
 NUMBERS_EVERY = 0.1
 # Maximum width of the current frame's picture [px]; the finest pyramid level within it is shown.
 THUMBNAIL = 320
+# Relative change of a keyframe's pose from which on it is rendered again for the thin places.
+STAYS = 0.02
 # Time after which a paused run resumes if the browser that paused it, or the last one, has disconnected [s].
 PATIENCE = 5.0
 
@@ -105,6 +108,7 @@ class LiveViewer(Observer):
         self._visited = False  # whether any browser has connected
         self._behind = True  # the page's splats are older than the map
         self._failed = False
+        self._seen: dict[int, SeenDepth] = {}  # of the keyframes, for the mode of thin places
 
     def close(self) -> None:
         """Stop serving the page."""
@@ -258,11 +262,22 @@ class LiveViewer(Observer):
 
         largest = images.max_width, images.max_height
         try:
-            paint = painter(browser, self.page.units, render, largest, store.scene_depth, poses, photograph)
+            depth, units = store.scene_depth, self.page.units
+            paint = painter(browser, units, render, largest, depth, poses, photograph, lambda: self._depths(render))
         finally:
             images.resize(*size)  # also clears the buffers, so that the mapper's next step does not pay for it
         if paint is not None:
             self._updates.put(Update(picture=(browser.client, paint)))
+
+    def _depths(self, render: Callable[[PinholeCamera, NDArray[np.float64]], RenderedView]) -> list[SeenDepth]:
+        """Render the keyframes that are new, or have moved since, and return what all of them see."""
+        store = self._mapper.pipeline.keyframes
+        for view in store.selected:
+            before, T = self._seen.get(view.index), view.T_camera_world
+            if before is None or np.linalg.norm(before.T_camera_world - T) > STAYS * (1.0 + np.linalg.norm(T)):
+                camera = view.camera.within(SIDE)
+                self._seen[view.index] = SeenDepth.of(T, camera, render(camera, T))
+        return list(self._seen.values())
 
     # ---- the publishing thread -------------------------------------------------------------------------------
 

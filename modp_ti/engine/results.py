@@ -9,6 +9,7 @@ import tempfile
 import time
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -34,10 +35,13 @@ from pipelines.companions.pace import CompletePace
 from pipelines.online import OnlineMapper
 from pipelines.pipeline import Pipeline
 from pipelines.render.renderer import RenderedView
+from pipelines.whole.coverage import SeenDepth
 
 STAGES = ("compile", "read", "track", "select", "depth", "occupancy", "optimise", "refine", "evaluate")
 # Map versions with a key in metrics.json; the value is null if the run did not make that version.
 MAPS = ("online", "refined", "offline")
+# Most frames that are asked where the map is thin.
+LOOKS = 100
 # What not every run has, or is only written after its scores.
 OUTDATED = (*NOT_ALWAYS, "metrics.json", "scores.csv", "report.html", "renders", "session.zip")
 
@@ -60,6 +64,11 @@ class Results:
         self._names = image_names(frames.name, config.export.images)
         self._album = Album.of(frames.held_out)
         self._survey = ErrorSurvey(held_out=any(frames.held_out))
+        # Of some frames, what they see of the map; by place among all frames.
+        mapped = [place for place, held_out in enumerate(frames.held_out) if not held_out]
+        looks = mapped[:: -(-len(mapped) // LOOKS) or 1]
+        self._looks = {frames.index[place]: place for place in looks}
+        self._seen: dict[int, SeenDepth] = {}
 
     @contextmanager
     def writing_map(self) -> Iterator[None]:
@@ -126,6 +135,8 @@ class Results:
             write_picture(self.folder / "renders" / f"{frame.index:06d}.png", pair)
         if self.config.export.report:
             self._album.keep(frame.index, frame.image, render.colour)
+            if (place := self._looks.get(frame.index)) is not None:
+                self._seen[place] = SeenDepth.of(frame.T_camera_world, frame.camera, render)
             if motion is not None and frame.held_out == self._survey.held_out:
                 self._survey.add(frame, render, motion)
 
@@ -168,6 +179,7 @@ class Results:
                 ),
                 survey=self._survey,
                 needles=Needles.of(version.gaussians, views),
+                seen=[replace(seen, T_camera_world=version.trajectory[place]) for place, seen in self._seen.items()],
             )
             write_report(self.folder / "report.html", run)
         except Exception as error:  # the map is finished; no error of the report may lose it

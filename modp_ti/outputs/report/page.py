@@ -22,6 +22,7 @@ from modp_ti.outputs.playback.map_renderer import eight_bits
 from modp_ti.outputs.report import facts, plots
 from modp_ti.outputs.report.record import RunRecord
 from modp_ti.outputs.report.where_wrong import ErrorSurvey, Needles
+from pipelines.whole.coverage import SeenDepth, where_to_film, widest_angles
 
 # Error at which the colour scale ends.
 FULL_SCALE = 0.2
@@ -165,6 +166,7 @@ class ReportedRun:
         comparisons: Frames next to renders of the final map.
         survey: Where the final map is wrong.
         needles: The needles of the final map.
+        seen: What some of the cameras see of the final map.
     """
 
     config: SceneConfig
@@ -179,6 +181,7 @@ class ReportedRun:
     comparisons: Sequence[Comparison]
     survey: ErrorSurvey
     needles: Needles
+    seen: Sequence[SeenDepth] = ()
 
 
 def write_report(path: Path, run: ReportedRun) -> None:
@@ -240,7 +243,19 @@ def _drawings(run: ReportedRun) -> dict[str, str]:
         "pace": any(note.lag is not None for note in frames) and (plots.pace, frames),
         "steps": bool(run.record.steps) and (plots.steps, run.record.steps),
         "place": bool(run.survey.by_depth()) and (plots.places, *run.survey.by_place(), run.survey.aspect),
+        "thin": bool(run.seen) and (plots.coverage, *_thin(run, plan, floor[0], centres)),
         "trajectory": (plots.trajectory, plan, run.tracked, last.trajectory, run.keyframes, floor, truth),
         "poses": online and (plots.pose_changes, run.tracked, ways, run.scene_depth),
     }
     return {name: plots.svg(*drawing) for name, drawing in drawn.items() if drawing}
+
+
+def _thin(
+    run: ReportedRun, plan: NDArray[np.float64], floor: NDArray[np.float64], centres: NDArray[np.float64]
+) -> tuple[Any, ...]:
+    """Return the values of `plots.coverage`."""
+    points = floor @ plan
+    angles = widest_angles(points, run.seen, run.scene_depth)
+    film = where_to_film(points, angles, run.seen)
+    on_page = None if film is None else (plan[:2] @ film[0], plan[:2] @ film[1])
+    return centres @ plan[:2].T, floor[:, :2], angles, on_page

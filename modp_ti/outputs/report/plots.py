@@ -15,6 +15,7 @@ from fields.geometry.se3 import camera_centres
 from fields.map.gaussians import SH_C0
 from modp_ti.outputs.evaluation import FrameScore
 from modp_ti.outputs.report.record import FrameNote, StepNote
+from pipelines.whole.coverage import THIN
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -305,7 +306,9 @@ def plan_of(poses: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
 def floor_plan(
     plan: NDArray[np.float64], gaussians: Mapping[str, NDArray], centres: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return page positions (N, 2) and colours (N, 3) of the opaque Gaussians below the cameras, lowest first.
+    """Return positions (N, 3) along the plan's axes and colours (N, 3) of the opaque Gaussians below the cameras.
+
+    The lowest come first.
 
     Args:
         plan: The axes of the view, see `plan_of`.
@@ -319,7 +322,7 @@ def floor_plan(
     shown = shown[:: max(1, -(-len(shown) // MOST_SHOWN))]
     shown = shown[np.argsort(position[shown, 2], kind="stable")]
     colour = 0.5 + SH_C0 * np.asarray(gaussians["sh"], dtype=np.float64)[shown, 0]
-    return position[shown, :2], np.clip(colour, 0.0, 1.0)
+    return position[shown], np.clip(colour, 0.0, 1.0)
 
 
 def trajectory(
@@ -337,7 +340,7 @@ def trajectory(
         before: The tracker's T_camera_world (4, 4).
         after: T_camera_world (4, 4) after mapping.
         keyframes: Positions of the keyframes among the frames.
-        floor: Page positions (N, 2) and colours (N, 3) of Gaussians.
+        floor: Positions (N, 3) and colours (N, 3) of Gaussians, see `floor_plan`.
         truth: (M, 3) true camera centres in the map's world, or None.
     """
     from matplotlib.figure import Figure
@@ -356,9 +359,9 @@ def trajectory(
     whole, close = figure.subplots(1, 2)
     if len(floor[0]):
         size = float(np.clip(30_000 / len(floor[0]), 1.0, 14.0))
-        whole.scatter(*floor[0].T, s=size, c=floor[1], alpha=0.6, linewidths=0, rasterized=True)
+        whole.scatter(*floor[0].T[:2], s=size, c=floor[1], alpha=0.6, linewidths=0, rasterized=True)
     for axes, name, (low, high) in (
-        (whole, "in the map", _extent(around, floor[0])),
+        (whole, "in the map", _extent(around, floor[0][:, :2])),
         (close, "closer", _extent(around, around[:0])),
     ):
         for curve in curves:
@@ -369,6 +372,38 @@ def trajectory(
         axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xlabel="scene units")
         axes.set_title(name, fontsize=9)
     figure.legend(*close.get_legend_handles_labels(), ncols=5, loc="outside upper center")
+    return figure
+
+
+def coverage(
+    way: NDArray[np.float64],
+    floor: NDArray[np.float64],
+    angles: NDArray[np.float64],
+    film: tuple[NDArray[np.float64], NDArray[np.float64]] | None,
+) -> Figure:
+    """Plot from above how wide an angle the places of a map are seen from.
+
+    Args:
+        way: Camera centres (M, 2) on the page.
+        floor: Page positions (N, 2) of Gaussians.
+        angles: Their angles (N,) [degrees], NaN where no camera sees them.
+        film: Page positions (2,) of where to stand and of what to film next, or None.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(WIDTH, 4.6))
+    axes = figure.subplots()
+    size = float(np.clip(60_000 / max(len(floor), 1), 1.0, 14.0))
+    style = {"cmap": "turbo_r", "vmin": 0.0, "vmax": 2 * THIN, "alpha": 0.7, "linewidths": 0, "rasterized": True}
+    known = np.isfinite(angles)
+    drawn = axes.scatter(*floor[known].T, s=size, c=angles[known], **style)
+    axes.plot(*way.T, color=GREY, label="camera")
+    if film is not None:
+        arrow = {"arrowstyle": "-|>", "lw": 2.0, "color": "black"}
+        axes.annotate("", xy=tuple(film[1]), xytext=tuple(film[0]), arrowprops=arrow)
+    low, high = _extent(way if film is None else np.concatenate([way, np.stack(film)]), floor)
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xlabel="scene units")
+    figure.colorbar(drawn, ax=axes, shrink=0.9, label="widest angle between two cameras [degrees]")
     return figure
 
 

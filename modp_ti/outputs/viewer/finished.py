@@ -21,6 +21,7 @@ from modp_ti.outputs.playback.run_frames import kept_images, pictures
 from modp_ti.outputs.viewer.handover import BrowserCamera
 from modp_ti.outputs.viewer.modes import MODES, SPLATS, Photograph, painter, pinhole_of, splats_of
 from modp_ti.outputs.viewer.page import Page, ShownFrame
+from pipelines.whole.coverage import SIDE, SeenDepth
 from pipelines.whole.hierarchy import Hierarchy
 
 # Pictures for a browser are at most this large, or as large as the run's cameras if those are larger [px].
@@ -49,11 +50,13 @@ class FinishedViewer:
     def __init__(self, run: FinishedRun, settings: ViewSettings, device: str) -> None:
         self.run = run
         self._max_splats = settings.max_splats
+        self._seen: list[SeenDepth] = []
         self._chosen: dict[int, int] = {}  # the frames that browsers wait for
         gaussians, points = run.gaussians, _tracked_points(run)
         self._kept = kept_images(run) is not None
         self._exposures = read_exposures(run.folder / "exposure.json") if self._kept else {}
-        modes = MODES if self._kept else tuple(mode for mode in MODES if mode != "error")
+        without = () if self._kept else ("error",) if run.folder.is_dir() else ("error", "thin")
+        modes = tuple(mode for mode in MODES if mode not in without)
         self.page = Page(settings.host, settings.port, None, modes, self.choose, len(run), Ruler.of(run))
         self.url = self.page.url
         start_device(device)
@@ -112,9 +115,18 @@ class FinishedViewer:
             record.scene_depth,
             self.run.poses[mapped],
             lambda index: self._photograph(mapped[index]),
+            self._depths,
         )
         if paint is not None:
             self.page.show_picture(browser.client, paint())
+
+    def _depths(self) -> list[SeenDepth]:
+        """What the keyframes see, rendered at the first call."""
+        if not self._seen:
+            for index in self.run.record.keyframes:
+                camera, T = self.run.cameras[index].within(SIDE), self.run.poses[index]
+                self._seen.append(SeenDepth.of(T, camera, self._renderer.view(camera, T)))
+        return self._seen
 
     def _show_splats(self, browser: BrowserCamera, detail: Hierarchy) -> None:
         """Show a browser the blocks of a large map, the far ones with less detail; see `Hierarchy`.

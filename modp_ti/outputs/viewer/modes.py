@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -16,10 +16,11 @@ from modp_ti.outputs.playback.film import DEPTH_RANGE, depth_colours
 from modp_ti.outputs.playback.map_renderer import eight_bits
 from modp_ti.outputs.viewer.handover import BrowserCamera
 from pipelines.render.renderer import RenderedView
+from pipelines.whole.coverage import THIN, SeenDepth, where_to_film, widest_angles
 
 # The browser draws splats itself. The other modes are background pictures from this program's renderer.
 SPLATS = "splats"
-MODES = (SPLATS, "colour", "depth", "opacity", "error")
+MODES = (SPLATS, "colour", "depth", "opacity", "thin", "error")
 # Valid ranges of a browser's field of view [rad] and canvas aspect (width / height). Others are ignored as faulty.
 FIELDS_OF_VIEW = (np.radians(1.0), np.radians(170.0))
 ASPECTS = (0.1, 10.0)
@@ -28,6 +29,9 @@ LEAST_SIDE = 16
 LARGEST_ERROR = 0.25
 # Grey value of pixels that no photograph shows and that therefore have no error.
 UNSEEN = 40
+# Angle at which the scale of thin places ends [degrees]; every so many-th pixel has one.
+WIDE, EVERY = 2 * THIN, 4
+ARROW = (255, 255, 255)
 # A photograph sees a surface if the map's depth there agrees within this relative tolerance.
 SAME_SURFACE = 0.05
 
@@ -143,6 +147,7 @@ def painter(
     scene_depth: float,
     poses: NDArray[np.float64],
     photograph: Callable[[int], Photograph],
+    seen: Callable[[], Sequence[SeenDepth]],
 ) -> Callable[[], NDArray[np.uint8]] | None:
     """Render what a browser's mode needs.
 
@@ -154,6 +159,7 @@ def painter(
         scene_depth: The scene's depth [scene units].
         poses: (N, 4, 4) T_camera_world of the photographs, for the error mode.
         photograph: Returns the photograph with this index among `poses`.
+        seen: Returns what the keyframes see, for the mode of thin places.
 
     Returns:
         A function that computes the picture (H, W, 3) and does not use the map any more; None if the browser's camera
@@ -165,13 +171,16 @@ def painter(
     camera, T_camera_world = seen_from
     try:
         view = render(camera, T_camera_world)
+        if browser.mode == "thin":
+            depths = seen()
+            return lambda: thin_picture(view, camera, T_camera_world, depths, scene_depth)
         if browser.mode != "error":
             return lambda: picture_of(view, browser.mode, scene_depth)
         taken = photograph(nearest_photograph(poses, T_camera_world, scene_depth))
-        seen = render(taken.camera, taken.T_camera_world)
+        there = render(taken.camera, taken.T_camera_world)
     except ValueError:
         return None
-    return lambda: error_picture(image_error(view, camera, T_camera_world, taken, seen))
+    return lambda: error_picture(image_error(view, camera, T_camera_world, taken, there))
 
 
 def picture_of(view: RenderedView, mode: str, scene_depth: float) -> NDArray[np.uint8]:
@@ -192,6 +201,8 @@ def scale_of(mode: str, scene_depth: float) -> str:
         colours, what = turbo[::-1], "depth [scene units], logarithmic"
     elif mode == "error":
         ends, colours, what = [0.0, LARGEST_ERROR / 2, LARGEST_ERROR], turbo, "mean colour difference, of 1"
+    elif mode == "thin":
+        ends, colours, what = [0.0, THIN, WIDE], turbo[::-1], "widest angle between keyframes [degrees]"
     elif mode == "opacity":
         ends, colours, what = [0.0, 0.5, 1.0], np.repeat(steps[0, :, None], 3, axis=1), "opacity"
     else:
@@ -262,6 +273,51 @@ def image_error(
     shown = look_up(photograph.rgba[..., :3].astype(np.float32) / 255.0)
     error = np.abs(np.clip(colour, 0.0, 1.0) - shown).mean(axis=2)
     return np.where(before.reshape(z.shape) & same & valid, error, np.nan).astype(np.float32)
+
+
+def thin_picture(
+    view: RenderedView,
+    camera: PinholeCamera,
+    T_camera_world: NDArray[np.float64],
+    seen: Sequence[SeenDepth],
+    scene_depth: float,
+) -> NDArray[np.uint8]:
+    """Colour a view by how wide an angle its places are seen from: red for one direction, blue for WIDE and more.
+
+    Dark grey is seen by no keyframe. An arrow leads from where to stand to what to film next, if anything is thin.
+
+    Args:
+        view: Rendered view.
+        camera: Camera of `view`.
+        T_camera_world: (4, 4) pose of `view`.
+        seen: What the keyframes see.
+        scene_depth: The scene's depth [scene units].
+
+    Returns:
+        Picture (H, W, 3).
+    """
+    z = view.expected_depth().astype(np.float64)[EVERY // 2 :: EVERY, EVERY // 2 :: EVERY]
+    pixels = EVERY * (np.stack(np.meshgrid(*map(np.arange, z.shape[::-1])), axis=-1).reshape(-1, 2) + 0.5)
+    T_world_camera = inverse_se3(T_camera_world)
+    points = camera.unproject(pixels, z.ravel()) @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+    angles = np.where(z.ravel() > 0, widest_angles(points, seen, scene_depth), np.nan)
+    scaled = eight_bits(1.0 - np.clip(np.nan_to_num(angles), 0.0, WIDE) / WIDE).reshape(z.shape)
+    colours = cv2.applyColorMap(scaled, cv2.COLORMAP_TURBO)[..., ::-1]
+    colours = np.where(np.isfinite(angles).reshape(z.shape)[..., None], colours, UNSEEN).astype(np.uint8)
+    size = camera.width, camera.height
+    colours = cv2.resize(colours, size, interpolation=cv2.INTER_NEAREST).astype(np.float32)
+    grey = 255.0 * np.clip(view.colour, 0.0, 1.0).mean(axis=2, keepdims=True)
+    picture = np.ascontiguousarray(np.round(0.5 * (colours + grey)).astype(np.uint8))
+    way = where_to_film(points, angles, seen)
+    if way is not None:
+        place, target = (T_camera_world[:3, :3] @ end + T_camera_world[:3, 3] for end in way)
+        head = camera.project(target[None])[0]
+        # A place behind the camera, or next to it, is shown by its direction.
+        aside = place[:2] / max(float(np.linalg.norm(place[:2])), 1e-9)
+        tail = camera.project(place[None])[0] if place[2] > 0.1 * target[2] else (0.5 + 0.45 * aside) * size
+        ends = [tuple(np.clip(end, 0, size).round().astype(int).tolist()) for end in (tail, head)]
+        cv2.arrowedLine(picture, *ends, ARROW, max(2, camera.width // 200), cv2.LINE_AA, tipLength=0.15)
+    return picture
 
 
 def error_picture(error: NDArray[np.float32]) -> NDArray[np.uint8]:

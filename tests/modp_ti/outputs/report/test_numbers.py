@@ -155,7 +155,7 @@ def test_the_floor_is_what_is_opaque_and_below_the_cameras_the_highest_on_top() 
     sh[0, 0], sh[1, 0] = [1.0, 0, 0], [0, 9.0, -9.0]
     centres = np.array([-T[:3, :3].T @ T[:3, 3] for T in poses])
     places, colours = floor_plan(plan, {"position": position, "opacity_logit": logit, "sh": sh}, centres)
-    np.testing.assert_allclose(places, position[[1, 0]].astype(float) @ plan[:2].T, atol=1e-6)
+    np.testing.assert_allclose(places, position[[1, 0]].astype(float) @ plan.T, atol=1e-6)
     np.testing.assert_allclose(colours, [[0.5, 1, 0], [0.5 + 0.5 / np.sqrt(np.pi), 0.5, 0.5]], atol=1e-6)
 
 
