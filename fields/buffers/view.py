@@ -26,7 +26,8 @@ class ViewField:
         limits: Bounds (left, right, top, bottom) of x/z and y/z within which the projection is linearised.
         near: Depth below which nothing is drawn [scene units].
         size: Width and height [px].
-        values: The numbers of these fields (21,) as kernels take them, but for the size.
+        pose: Rotation and translation (12,) as kernels take them.
+        lens: Focal lengths, principal point, limits and near (9,) as kernels take them.
     """
 
     def __init__(self, builder: ti.FieldsBuilder, real=ti.f32) -> None:
@@ -41,46 +42,55 @@ class ViewField:
         self.size = ti.Vector.field(2, ti.i32)
         builder.place(self.rotation, self.translation, self.focal, self.centre, self.limits, self.near, self.size)
         self._launch = CompiledKernel(self._set)
-        self.values: np.ndarray | torch.Tensor = np.zeros(21, dtype=self.dtype)
+        self.pose: np.ndarray | torch.Tensor = np.zeros(12, dtype=self.dtype)
+        self.lens: np.ndarray | torch.Tensor = np.zeros(9, dtype=self.dtype)
+        self._lens_of: tuple[PinholeCamera, float] | None = None
         self.width = 0
         self.height = 0
 
-    def set(self, camera: PinholeCamera, T_camera_world: ArrayLike, near: float) -> None:
+    def set(self, camera: PinholeCamera, T_camera_world: ArrayLike | torch.Tensor, near: float) -> None:
         """Set the view: a pose (4, 4), and the depth below which nothing is drawn [scene units].
 
-        On a GPU, the fields are written by the first kernel of the projection.
+        On a GPU, the fields are written by the first kernel of the projection, and the pose may lie on the device: a
+        tensor (12,) of its rotation and translation.
         """
-        T = np.asarray(T_camera_world, dtype=np.float64)
+        if isinstance(T_camera_world, torch.Tensor):
+            self.pose = T_camera_world
+        else:
+            T = np.asarray(T_camera_world, dtype=np.float64)
+            self.pose = without_waiting(np.concatenate([T[:3, :3].ravel(), T[:3, 3]]).astype(self.dtype))
+        if self._lens_of != (camera, near):
+            self._lens_of = camera, near
+            self._set_lens(camera, near)
+        if not on_gpu():
+            self._launch(self.pose, self.lens, self.width, self.height)
+
+    def _set_lens(self, camera: PinholeCamera, near: float) -> None:
         fx, fy, cx, cy, width, height = camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height
         margin_x, margin_y = FRUSTUM_MARGIN * 0.5 * width / fx, FRUSTUM_MARGIN * 0.5 * height / fy
         limits = (-cx / fx - margin_x, (width - cx) / fx + margin_x, -cy / fy - margin_y, (height - cy) / fy + margin_y)
-        values = np.empty(21, dtype=self.dtype)
-        values[:9], values[9:12] = T[:3, :3].reshape(9), T[:3, 3]
-        values[12:] = (fx, fy, cx, cy, *limits, near)
         self.width, self.height = width, height
-        self.values = without_waiting(values)
-        if not on_gpu():
-            self._launch(self.values, width, height)
+        self.lens = without_waiting(np.array((fx, fy, cx, cy, *limits, near), dtype=self.dtype))
 
     @ti.kernel
-    def _set(self, values: ti.types.ndarray(), width: ti.i32, height: ti.i32):
+    def _set(self, pose: ti.types.ndarray(), lens: ti.types.ndarray(), width: ti.i32, height: ti.i32):
         ti.loop_config(serialize=True)
         for _ in range(1):
-            self.write(values, width, height)
+            self.write(pose, lens, width, height)
 
     @ti.func
-    def write(self, values: ti.template(), width, height):
-        """Write `values` to the fields."""
+    def write(self, pose: ti.template(), lens: ti.template(), width, height):
+        """Write `pose` and `lens` to the fields."""
         for r in ti.static(range(3)):
             for c in ti.static(range(3)):
-                self.rotation[None][r, c] = values[3 * r + c]
-            self.translation[None][r] = values[9 + r]
+                self.rotation[None][r, c] = pose[3 * r + c]
+            self.translation[None][r] = pose[9 + r]
         for c in ti.static(range(2)):
-            self.focal[None][c] = values[12 + c]
-            self.centre[None][c] = values[14 + c]
+            self.focal[None][c] = lens[c]
+            self.centre[None][c] = lens[2 + c]
         for c in ti.static(range(4)):
-            self.limits[None][c] = values[16 + c]
-        self.near[None] = values[20]
+            self.limits[None][c] = lens[4 + c]
+        self.near[None] = lens[8]
         self.size[None] = ti.Vector([width, height])
 
 

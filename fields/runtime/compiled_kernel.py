@@ -122,19 +122,14 @@ class AsyncReadback:
     The copy into pinned memory is queued behind the kernels launched so far. Later writes to the tensor do not affect
     it. Pinned memory and events are used again once they have been read, since making them anew took the host twice as
     long as the copy.
-
-    Args:
-        tensor: Tensor to copy.
-        summed: Return the sum over the first axis, in float64.
     """
 
     _spare: ClassVar[dict[tuple[torch.dtype, torch.Size], list[tuple[torch.Tensor, torch.cuda.Event]]]] = {}
 
-    def __init__(self, tensor: torch.Tensor, summed: bool = False) -> None:
+    def __init__(self, tensor: torch.Tensor) -> None:
         self._values: np.ndarray | None = None
-        self._summed = summed
         if not tensor.is_cuda:
-            self._values = self._reduced(tensor.numpy())
+            self._values = tensor.numpy().copy()
             return
         self._kind = (tensor.dtype, tensor.shape)
         spare = self._spare.setdefault(self._kind, [])
@@ -150,9 +145,6 @@ class AsyncReadback:
         """Return the values. Waits for the copy if it has not finished."""
         if self._values is None:
             self._event.synchronize()
-            self._values = self._reduced(self._host.numpy())
+            self._values = np.array(self._host.numpy())
             self._spare[self._kind].append((self._host, self._event))
         return self._values
-
-    def _reduced(self, values: np.ndarray) -> np.ndarray:
-        return values.sum(axis=0, dtype=np.float64) if self._summed else values.copy()

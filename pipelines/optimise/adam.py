@@ -38,7 +38,7 @@ class LearningRates:
 
 
 @ti.func
-def _bits(x):
+def bits(x):
     """The bits of |x| as float32, which order like the values, with infinity and NaN above all.
 
     A comparison of floats would not detect NaN, since the compiler may assume that there is none (fast math).
@@ -47,7 +47,7 @@ def _bits(x):
 
 
 @ti.func
-def _one_over_complement(x):
+def one_over_complement(x):
     """1 / (1 - exp(x)) for x < 0, by a series near 0, where the difference would lose all precision."""
     series = -x * (1.0 + x * (0.5 + x * (1.0 / 6.0 + x * (1.0 / 24.0))))
     return 1.0 / ti.select(x > -0.05, series, 1.0 - ti.exp(x))
@@ -135,7 +135,7 @@ class Adam:
                 self.gaussians.steps[i] = self.gaussians.steps[i] + 1
                 t = ti.cast(self.gaussians.steps[i], ti.f32)
                 betas = ti.Vector([beta1, beta2])
-                corrections = ti.Vector([_one_over_complement(t * log_beta1), _one_over_complement(t * log_beta2)])
+                corrections = ti.Vector([one_over_complement(t * log_beta1), one_over_complement(t * log_beta2)])
                 # Vectors, and not components, since unrolled code compiles slowly in Taichi.
                 g = self.gaussians
                 self._update_field(i, g.position, g.position_m, g.position_v, lr_position, betas, corrections, eps)
@@ -160,13 +160,13 @@ class Adam:
 
     @ti.func
     def _magnitude(self, i, active):
-        """Sum of the magnitudes of a Gaussian's gradient, as bits (see `_bits`)."""
+        """Sum of the magnitudes of a Gaussian's gradient, as bits (see `bits`)."""
         g = self.gaussians
         total = ti.abs(g.opacity_logit.grad[i]) + ti.abs(g.position.grad[i]).sum() + ti.abs(g.log_scale.grad[i]).sum()
         total += ti.abs(g.quaternion.grad[i]).sum()
         for k in range(active):
             total += ti.abs(g.sh.grad[i, k]).sum()
-        return _bits(total)
+        return bits(total)
 
 
 @ti.data_oriented
@@ -236,6 +236,18 @@ class Moments:
         m = self._first[index] = beta1 * self._first.get(index, none) + (1 - beta1) * gradient
         v = self._second[index] = beta2 * self._second.get(index, none) + (1 - beta2) * gradient**2
         return rate * (m / (1 - beta1**count)) / (np.sqrt(v / (1 - beta2**count)) + 1e-15)
+
+    def of(self, index: int) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return both moments of a keyframe (S, flat) and its number of steps (1,)."""
+        none = np.zeros(self._shape)
+        m, v = (table.get(index, none).ravel() for table in (self._first, self._second))
+        return m, v, np.array([self.steps.get(index, 0)], dtype=np.float64)
+
+    def put(self, index: int, first: NDArray[np.float64], second: NDArray[np.float64], steps: int) -> None:
+        """Replace the moments of a keyframe (S) and its number of steps; with none, it is forgotten."""
+        self._first[index], self._second[index], self.steps[index] = first, second, steps
+        if steps == 0:
+            self.forget(index)
 
     def forget(self, index: int) -> None:
         """Forget the steps of a keyframe."""

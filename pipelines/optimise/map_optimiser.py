@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fields.map.gaussians import GaussianField
 from fields.map.keyframe import Keyframe
 from fields.map.keyframes import KeyframeStore
-from fields.runtime.compiled_kernel import AsyncReadback
 from pipelines.companions.companion import Companion
 from pipelines.companions.exposure import ExposureRefinement
 from pipelines.optimise.adam import Adam, AspectPenalty, LearningRates
+from pipelines.optimise.cameras import make_cameras
 from pipelines.optimise.measured_depth import MeasuredDepthLoss
 from pipelines.optimise.poses import PoseRefinement
 from pipelines.render.formulas import LossValues
@@ -51,10 +49,9 @@ class MapOptimiser:
         self.safeguards = Safeguards()
         self.poses = PoseRefinement(self.safeguards)
         self.exposure = ExposureRefinement(settings.exposure, self.safeguards)
-        # Results of steps that have not been applied yet: loss values of the views, with the level of each step, and
-        # updates of pose and exposure by frame index. Both are empty between steps on the CPU.
+        self.cameras = make_cameras(renderer, self.poses, self.exposure)
+        # Loss values of views that have not been read yet, with the level of each step. Empty between steps on the CPU.
         self._unread: deque[tuple[list[tuple[Keyframe, LossValues]], int]] = deque()
-        self._moves: dict[int, list[Callable[[], None]]] = {}
         self._psnr = float("nan")
         self.companions = companions
 
@@ -91,8 +88,7 @@ class MapOptimiser:
             Values of the loss.
         """
         image = view.image(level)
-        self.renderer.forward(image.camera, view.T_camera_world, self.settings.near * scene_depth, exact)
-        self.renderer.develop(view.exposure, view.vignette)
+        self.cameras.render(view, image, self.settings.near * scene_depth, exact)
         return self.loss.forward(image.rgba)
 
     def step(
@@ -102,8 +98,8 @@ class MapOptimiser:
 
         Updates the Gaussians, the errors of the keyframes, their poses and, where estimated, their exposures. The pose
         of the first keyframe is fixed, and pose and exposure of the first one of each further place. On a GPU, the host
-        does not wait for the device: errors and PSNR lag by one step (NaN at first), and a pose is updated before its
-        keyframe is rendered again. `settle` applies all pending results.
+        does not wait for the device: errors and PSNR lag by one step (NaN at first), and poses and exposures stay on
+        the device. `settle` applies all pending results.
 
         Args:
             store: The keyframes.
@@ -138,7 +134,7 @@ class MapOptimiser:
         """
         while self._unread:
             self._read(*self._unread.popleft())
-        self._move()
+        self.cameras.settle()
         return self._psnr
 
     def _read(self, seen: list[tuple[Keyframe, LossValues]], level: int) -> None:
@@ -150,55 +146,27 @@ class MapOptimiser:
         if sound:
             self._psnr = float(np.mean([values.psnr for _, values in sound]))
 
-    def _move(self, view: Keyframe | None = None) -> None:
-        """Apply the pending pose and exposure steps of a keyframe, or of all keyframes if None."""
-        for key in list(self._moves) if view is None else [view.index]:
-            for move in self._moves.pop(key, ()):
-                move()
-
     def _step(
         self, store: KeyframeStore, views: list[int], rates: LearningRates, pose_rate: float, level: int
     ) -> list[tuple[Keyframe, LossValues]]:
         o = self.settings.optimise
         seen: list[tuple[Keyframe, LossValues]] = []
-        pose_gradients: dict[int, list[AsyncReadback]] = {}
-        exposure_gradients: dict[int, list[AsyncReadback]] = {}
-        for j in views:
-            view = store[j]
-            self._move(view)
+        for k, j in enumerate(views):
+            view, is_last = store[j], j not in views[k + 1 :]
             values = self.compare(view, store.scene_depth, level, exact=False)
             self.loss.backward(o.ssim_weight, 1.0 / len(views))
             measured = self.measured.backward(view, view.image(level).camera, 1.0 / len(views))
             self.renderer.backward(with_depth=measured)
             self.measured.clear()
             seen.append((view, values))
-            begins = j == 0 or view.index in store.begins
-            if pose_rate > 0 and not begins:
-                pose_gradients.setdefault(j, []).append(self.renderer.async_camera_gradient())
+            if pose_rate > 0 and j > 0 and view.index not in store.begins:
+                self.cameras.step_pose(view, pose_rate, is_last)
             if view.exposure is not None and view.index not in store.begins:
-                exposure_gradients.setdefault(j, []).append(self.renderer.async_exposure_gradient())
+                self.cameras.step_exposure(view, views.count(j) / len(views), is_last)
         self.aspect.backward(o.aspect_weight, store.scene_depth)
         rendered = [view for view, _ in seen]
         for companion in self.companions:
             companion.before_update(rendered)
         self.adam.step(rates, len(views), largest=EXPLODED * store.scene_depth)
-        for j, gradients in pose_gradients.items():
-            move = partial(self._move_pose, store[j], gradients, pose_rate)
-            self._moves.setdefault(store[j].index, []).append(move)
-        for j, gradients in exposure_gradients.items():
-            move = partial(self._move_exposure, store[j], gradients, views.count(j) / len(views))
-            self._moves.setdefault(store[j].index, []).append(move)
-        if self.loss.lag == 0:
-            self._move()
+        self.cameras.move()
         return seen
-
-    def _move_pose(self, view: Keyframe, gradients: list[AsyncReadback], rate: float) -> None:
-        self.poses.step(view, _total(gradients), rate)
-
-    def _move_exposure(self, view: Keyframe, gradients: list[AsyncReadback], weight: float) -> None:
-        self.exposure.step(view, _total(gradients), weight)
-
-
-def _total(gradients: list[AsyncReadback]) -> NDArray[np.float64]:
-    """Sum of gradients, in order. Waits for the device."""
-    return np.sum([g.numpy().astype(np.float64) for g in gradients], axis=0)

@@ -10,6 +10,7 @@ from functools import cached_property
 
 import cv2
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from fields.buffers.images import PAD, ImageBuffers
@@ -244,17 +245,19 @@ class PhotometricBuffers(ABC):
         self.real = images.real
         self._active = False
         self._made = False
-        self._exposure = np.array(IDENTITY)
+        self._exposure: np.ndarray | torch.Tensor = np.array(IDENTITY)
         self._loaded: tuple[int, int, int] | None = None  # the vignette in the buffer: its id and size
         self._resized: dict[tuple[int, int, int], tuple[np.ndarray, np.ndarray]] = {}
 
-    def forward(self, exposure: np.ndarray | None, vignette: np.ndarray | None) -> None:
+    def forward(self, exposure: np.ndarray | torch.Tensor | None, vignette: np.ndarray | None) -> None:
         self._active = exposure is not None or vignette is not None
         if not self._active:
             return
         self._make_buffers()
         self._load(vignette)
-        self._exposure = np.ascontiguousarray(IDENTITY if exposure is None else exposure, dtype=np.float64)
+        if not isinstance(exposure, torch.Tensor):
+            exposure = np.ascontiguousarray(IDENTITY if exposure is None else exposure, dtype=np.float64)
+        self._exposure = exposure
         self._develop()
 
     def backward(self) -> None:

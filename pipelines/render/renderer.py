@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from fields.buffers.device_pairs import DevicePairs
@@ -14,7 +15,6 @@ from fields.buffers.view import ProjectedGaussians, ViewField
 from fields.geometry.camera import PinholeCamera
 from fields.map.gaussians import GaussianField
 from fields.runtime.backend import on_gpu, refuse_too_many_fields
-from fields.runtime.compiled_kernel import AsyncReadback
 from fields.runtime.engine import ti
 from fields.runtime.tenancy import in_engine, settled
 from pipelines.render.cpu.binning import CHUNKS, Binning
@@ -42,10 +42,6 @@ class ProjectionStage(Protocol):
 
     def camera_gradient(self) -> np.ndarray:
         """Return d loss / d xi (6,) of the view's T_camera_world, summed in a fixed order."""
-        ...
-
-    def async_camera_gradient(self) -> AsyncReadback:
-        """Return `camera_gradient` as an asynchronous copy. On the CPU, there is nothing to wait for."""
         ...
 
 
@@ -77,11 +73,11 @@ class CompositingStage(Protocol):
 class PhotometricStage(Protocol):
     """Applies exposure and vignette to `images.colour` in place, and propagates `images.colour_grad` back."""
 
-    def forward(self, exposure: np.ndarray | None, vignette: np.ndarray | None) -> None:
+    def forward(self, exposure: np.ndarray | torch.Tensor | None, vignette: np.ndarray | None) -> None:
         """Apply exposure and vignette to the last rendered image.
 
         Args:
-            exposure: Exposure (A, b) (3, 4); None for the identity.
+            exposure: Exposure (A, b) (3, 4), on a GPU possibly a tensor (12,) on the device; None for the identity.
             vignette: Vignette (H, W, 3) at the camera's full size, which is resized to the image; None for none.
         """
 
@@ -90,10 +86,6 @@ class PhotometricStage(Protocol):
 
     def exposure_gradient(self) -> np.ndarray:
         """Return d loss / d (A, b) (3, 4) of the last image, after `backward`."""
-        ...
-
-    def async_exposure_gradient(self) -> AsyncReadback:
-        """Return `exposure_gradient` as an asynchronous copy. On the CPU, there is nothing to wait for."""
         ...
 
 
@@ -221,12 +213,14 @@ class Renderer:
             refuse_too_many_fields(self.pairs.last_placed)
         self.view_renders = 0
 
-    def forward(self, camera: PinholeCamera, T_camera_world: np.ndarray, near: float, exact: bool = True) -> None:
+    def forward(
+        self, camera: PinholeCamera, T_camera_world: np.ndarray | torch.Tensor, near: float, exact: bool = True
+    ) -> None:
         """Render a view into `images`.
 
         Args:
             camera: Intrinsics and image size.
-            T_camera_world: Pose (4, 4).
+            T_camera_world: Pose (4, 4), or as in `ViewField.set`.
             near: Depth below which nothing is drawn [scene units].
             exact: On a GPU, wait for the number of tile pairs. Optimisation steps do not wait; if a view has far more
                 pairs than the views before it, its farthest pairs are dropped once.
@@ -238,7 +232,7 @@ class Renderer:
         self.compositing.forward()
         self.develop(None, None)
 
-    def develop(self, exposure: np.ndarray | None, vignette: np.ndarray | None) -> None:
+    def develop(self, exposure: np.ndarray | torch.Tensor | None, vignette: np.ndarray | None) -> None:
         """Apply an exposure (A, b) (3, 4) and a vignette (H, W, 3) to the rendered image, each possibly None."""
         self.photometric.forward(exposure, vignette)
 
@@ -263,17 +257,9 @@ class Renderer:
         """Return d loss / d xi (6,) of the last rendered T_camera_world. Call it after `backward`."""
         return self.projection.camera_gradient()
 
-    def async_camera_gradient(self) -> AsyncReadback:
-        """Return `camera_gradient` as an asynchronous copy, without waiting for the device."""
-        return self.projection.async_camera_gradient()
-
     def exposure_gradient(self) -> np.ndarray:
         """Return d loss / d exposure (3, 4) of the last rendered image. Call it after `backward`."""
         return self.photometric.exposure_gradient()
-
-    def async_exposure_gradient(self) -> AsyncReadback:
-        """Return `exposure_gradient` as an asynchronous copy, without waiting for the device."""
-        return self.photometric.async_exposure_gradient()
 
     def render(
         self,

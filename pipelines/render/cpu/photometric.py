@@ -7,10 +7,9 @@ gradient g of the loss with respect to the image and h = vignette * g, the gradi
 # pyright: reportInvalidTypeForm=false
 
 import numpy as np
-import torch
 
 from fields.buffers.images import PAD, ImageBuffers
-from fields.runtime.compiled_kernel import HANDED_OUT, AsyncReadback, CompiledKernel
+from fields.runtime.compiled_kernel import HANDED_OUT, CompiledKernel
 from fields.runtime.engine import ti
 from pipelines.render.formulas import PhotometricBuffers
 
@@ -30,9 +29,6 @@ class Photometric(PhotometricBuffers):
     def exposure_gradient(self) -> np.ndarray:
         # Sum the rows in a fixed order, so that two runs agree bit for bit.
         return self._sums[: self.images.height].sum(axis=0).reshape(3, 4)
-
-    def async_exposure_gradient(self) -> AsyncReadback:
-        return AsyncReadback(torch.from_numpy(self.exposure_gradient()))
 
     def _develop(self) -> None:
         self._apply(self.images.width, self.images.height, self._exposure)

@@ -10,11 +10,10 @@ have the same Gaussian, and adds to its gradients without atomics, with which th
 # pyright: reportArgumentType=false, reportIndexIssue=false, reportInvalidTypeForm=false, reportOptionalSubscript=false
 
 import numpy as np
-import torch
 
 from fields.buffers.view import ProjectedGaussians, ViewField
 from fields.map.gaussians import GaussianField
-from fields.runtime.compiled_kernel import HANDED_OUT, AsyncReadback, CompiledLoop
+from fields.runtime.compiled_kernel import HANDED_OUT, CompiledLoop
 from fields.runtime.engine import ti
 from pipelines.render.formulas import ProjectionFormulas
 from pipelines.render.spherical_harmonics import add_sh_gradient
@@ -70,9 +69,6 @@ class Projection(ProjectionFormulas):
         if count:
             self._sum_tangents(count, count, partial)
         return partial.sum(axis=0)
-
-    def async_camera_gradient(self) -> AsyncReadback:
-        return AsyncReadback(torch.from_numpy(self.camera_gradient()))
 
     # ---- which, and in which order ---------------------------------------------------------------------------
 

@@ -6,7 +6,7 @@ import torch
 
 from fields.buffers.images import PAD, ImageBuffers
 from fields.runtime.backend import torch_device, without_waiting
-from fields.runtime.compiled_kernel import AsyncReadback, CompiledKernel
+from fields.runtime.compiled_kernel import CompiledKernel
 from fields.runtime.engine import ti
 from pipelines.render.formulas import PhotometricBuffers
 from pipelines.render.gpu.reductions import THREAD_BITS, THREADS, partial_sums, sum_blocks, sum_over_block
@@ -16,7 +16,11 @@ NUMBERS = ti.types.ndarray(dtype=ti.f32, ndim=1)
 
 @ti.data_oriented
 class DevicePhotometric(PhotometricBuffers):
-    """Applies exposure and vignette to `images.colour` in place, and propagates gradients; see `Photometric`."""
+    """Applies exposure and vignette to `images.colour` in place, and propagates gradients; see `Photometric`.
+
+    Attributes:
+        gradient: d loss / d exposure (12,) of the last image.
+    """
 
     def __init__(self, images: ImageBuffers) -> None:
         super().__init__(images)
@@ -25,20 +29,20 @@ class DevicePhotometric(PhotometricBuffers):
             CompiledKernel(self._develop_pixels),
             CompiledKernel(self._undevelop_pixels),
         )
-        self._gradient = torch.zeros(12, dtype=torch.float32, device=torch_device())
+        self.gradient = torch.zeros(12, dtype=torch.float32, device=torch_device())
 
     def exposure_gradient(self) -> np.ndarray:
-        return self.async_exposure_gradient().numpy().astype(np.float64)
-
-    def async_exposure_gradient(self) -> AsyncReadback:
-        return AsyncReadback(self._gradient.view(3, 4))
+        return self.gradient.cpu().numpy().reshape(3, 4).astype(np.float64)
 
     def _develop(self) -> None:
-        self._numbers = without_waiting(self._exposure.astype(np.float32).ravel())
+        exposure = self._exposure
+        if isinstance(exposure, np.ndarray):
+            exposure = without_waiting(exposure.astype(np.float32).ravel())
+        self._numbers = exposure
         self._forward_pixels(self.images.width, self.images.height, self._numbers)
 
     def _undevelop(self) -> None:
-        self._backward_pixels(self.images.width, self.images.height, self._numbers, self._partial, self._gradient)
+        self._backward_pixels(self.images.width, self.images.height, self._numbers, self._partial, self.gradient)
 
     @ti.kernel
     def _develop_pixels(self, width: ti.i32, height: ti.i32, exposure: NUMBERS):

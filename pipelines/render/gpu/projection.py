@@ -8,7 +8,7 @@ import torch
 from fields.buffers.view import ProjectedGaussians, ViewField
 from fields.map.gaussians import GaussianField
 from fields.runtime.backend import torch_device
-from fields.runtime.compiled_kernel import AsyncReadback, CompiledKernel
+from fields.runtime.compiled_kernel import CompiledKernel
 from fields.runtime.engine import ti
 from pipelines.render.formulas import ProjectionFormulas
 from pipelines.render.gpu.binning import DeviceBinning
@@ -27,6 +27,9 @@ class DeviceProjection(ProjectionFormulas):
     """Culls, sorts and projects `gaussians` into `projected`, with the formulas of the CPU.
 
     Slots come in the order of depth: a GPU adds to gradients with atomics that cost it little.
+
+    Attributes:
+        tangents: Sums of the tangents' gradients by block (BLOCKS, 6).
     """
 
     def __init__(
@@ -38,7 +41,7 @@ class DeviceProjection(ProjectionFormulas):
         self._cull, self._project = CompiledKernel(self._cull_all), CompiledKernel(self._project_all)
         self._propagate = CompiledKernel(self._differentiable, reverse=True)
         self._sum_tangents = CompiledKernel(self._sum_all_tangents)
-        self._tangents = torch.zeros((BLOCKS, 6), dtype=torch.float32, device=torch_device())
+        self.tangents = torch.zeros((BLOCKS, 6), dtype=torch.float32, device=torch_device())
 
     def forward(self) -> int:
         self.projected.count = count = self.gaussians.count
@@ -46,7 +49,7 @@ class DeviceProjection(ProjectionFormulas):
         if len(self._depths) < n:
             self._depths = torch.empty(1 << (n - 1).bit_length(), dtype=torch.float32, device=torch_device())
         depths = self._depths[:n]
-        self._cull(count, self.view.values, self.view.width, self.view.height, depths)
+        self._cull(count, self.view.pose, self.view.lens, self.view.width, self.view.height, depths)
         # A stable sort keeps Gaussians of equal depth in order.
         ordered, gaussian = torch.sort(depths, stable=True)
         self._project(*self.binning.tiles(), ordered, gaussian, self.binning.make_counts(n))
@@ -56,15 +59,12 @@ class DeviceProjection(ProjectionFormulas):
         self._propagate()
 
     def camera_gradient(self) -> np.ndarray:
-        return self.async_camera_gradient().numpy()
-
-    def async_camera_gradient(self) -> AsyncReadback:
-        self._sum_tangents(self._tangents)
-        return AsyncReadback(self._tangents, summed=True)
+        self._sum_tangents(self.tangents)
+        return self.tangents.cpu().numpy().sum(axis=0, dtype=np.float64)
 
     @ti.kernel
-    def _cull_all(self, count: ti.i32, values: NUMBERS, width: ti.i32, height: ti.i32, depths: NUMBERS):
-        self.view.write(values, width, height)
+    def _cull_all(self, count: ti.i32, pose: NUMBERS, lens: NUMBERS, width: ti.i32, height: ti.i32, depths: NUMBERS):
+        self.view.write(pose, lens, width, height)
         self.projected.seen[None] = 0
         for i in range(depths.shape[0]):
             depth = 0.0
@@ -107,6 +107,11 @@ class DeviceProjection(ProjectionFormulas):
 
     @ti.kernel
     def _sum_all_tangents(self, out: ti.types.ndarray(dtype=ti.f32, ndim=2)):
+        self.sum_tangents(out)
+
+    @ti.func
+    def sum_tangents(self, out: ti.template()):
+        """Sum the gradients of the tangents by BLOCKS blocks, in a loop of a kernel, to (BLOCKS, 6)."""
         ti.loop_config(block_dim=THREADS)
         for first in range(BLOCKS * THREADS):
             thread = first & (THREADS - 1)
