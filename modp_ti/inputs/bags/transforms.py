@@ -10,13 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fields.geometry.se3 import inverse_poses
+from fields.geometry.se3 import interpolate_se3, inverse_poses
 from modp_ti.files.errors import InputError
 from modp_ti.files.trajectory import poses_of_quaternions
 from modp_ti.inputs.bags.bag import STATIC, TREES, Bag
-
-# Between quaternions whose cosine is larger, rotations are interpolated linearly: the sine of the angle is too small.
-ALMOST_EQUAL = 1.0 - 1e-9
 
 
 @dataclass(frozen=True)
@@ -26,13 +23,11 @@ class Motion:
     Attributes:
         times: Times (N,) [s], increasing; one time for a transform that always holds.
         T_parent_child: Poses (N, 4, 4).
-        quaternions: Their rotations (N, 4) as (x, y, z, w).
         fixed: Whether the transform holds at all times.
     """
 
     times: NDArray[np.float64]
     T_parent_child: NDArray[np.float64]
-    quaternions: NDArray[np.float64]
     fixed: bool = False
 
     @staticmethod
@@ -53,7 +48,7 @@ class Motion:
         rows = rows[np.argsort(rows[:, 0], kind="stable")]
         rows = rows[np.append(np.diff(rows[:, 0]) > 0, True)]
         poses = poses_of_quaternions(rows[:, 1:4], rows[:, 4:], lambda n: f"{where} at {rows[n, 0]:.6f} s")
-        return Motion(rows[:, 0], poses, rows[:, 4:] / np.linalg.norm(rows[:, 4:], axis=1)[:, None], fixed)
+        return Motion(rows[:, 0], poses, fixed)
 
     def at(self, times: NDArray[np.float64], max_gap: float) -> NDArray[np.float64]:
         """Return T_parent_child (M, 4, 4) at times (M,) [s].
@@ -69,18 +64,12 @@ class Motion:
         b = np.minimum(a + 1, last)
         span = self.times[b] - self.times[a]
         t = np.divide(times - self.times[a], span, out=np.zeros(len(times)), where=span > 0).clip(0.0, 1.0)
-        result = np.tile(np.eye(4), (len(times), 1, 1))
-        q_a, q_b = self.quaternions[a], self.quaternions[b]
-        cosine = (q_a * q_b).sum(axis=1)
-        q_b = np.where(cosine[:, None] < 0, -q_b, q_b)
-        angle = np.arccos(np.minimum(np.abs(cosine), ALMOST_EQUAL))
-        q = np.sin((1.0 - t) * angle)[:, None] * q_a + np.sin(t * angle)[:, None] * q_b
-        q /= np.linalg.norm(q, axis=1)[:, None]
-        result[:, :3, :3] = poses_of_quaternions(np.zeros((len(times), 3)), q, str)[:, :3, :3]
-        of_a, of_b = (1.0 - t)[:, None], t[:, None]
-        result[:, :3, 3] = of_a * self.T_parent_child[a, :3, 3] + of_b * self.T_parent_child[b, :3, 3]
+        result, T_b = self.T_parent_child[a], self.T_parent_child[b]
+        places = (1.0 - t)[:, None] * result[:, :3, 3] + t[:, None] * T_b[:, :3, 3]
+        for n in np.flatnonzero(t).tolist():
+            result[n] = interpolate_se3(result[n], T_b[n], float(t[n]))
+            result[n, :3, 3] = places[n]
         exact = times == self.times[a]
-        result[exact] = self.T_parent_child[a[exact]]
         outside = (times < self.times[0]) | (times > self.times[last])
         result[~exact & (outside | (span > max_gap))] = np.nan
         return result
