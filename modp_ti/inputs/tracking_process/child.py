@@ -43,7 +43,7 @@ def main() -> None:
         job = connection.recv()
     except EOFError:
         return
-    _Child(connection, CountsBoard(board), job).run()
+    _Child(connection, CountsBoard.of(board), job).run()
 
 
 class _Child:
@@ -95,7 +95,10 @@ class _Child:
         if self._images is not None:
             self._board.recording = self._images.recording
         if self._tracker is not None:
-            self._board.write(self._tracker.live, self._tracker.frame_count)
+            frames, live = self._tracker.frame_count, self._tracker.live
+            self._board.frame_count = -1 if frames is None else frames
+            for name in ("arrived", "tracked", "thinned", "lost", "newest") if live is not None else ():
+                setattr(self._board, name, getattr(live, name))
 
     def _send(self) -> None:
         """Send the events in order until the end; runs in a thread, so that the mapper does not hold up the tracker."""

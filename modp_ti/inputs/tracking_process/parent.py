@@ -6,6 +6,7 @@ images, each for itself.
 
 from __future__ import annotations
 
+import ctypes
 import mmap
 import os
 import subprocess
@@ -18,8 +19,6 @@ from functools import cached_property
 from multiprocessing import Pipe
 from pathlib import Path
 from typing import ClassVar
-
-import numpy as np
 
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
@@ -34,8 +33,6 @@ from modp_ti.inputs.sources.live import StoredFrames, kept_frames
 
 # Time [s] that the process gets to end by itself.
 PATIENCE = 2.0
-# Numbers of a `CountsBoard`: the counts, the number of frames, the wish to finish, and whether the stream goes on.
-NUMBERS = 8
 
 
 @dataclass(frozen=True)
@@ -85,50 +82,31 @@ class Ended:
     failure: str | None = None
 
 
-class CountsBoard:
-    """Counts of the stream in shared memory and whether it goes on, written by the child; the parent's wish to end it.
+class CountsBoard(ctypes.Structure):
+    """Numbers in shared memory, each of which is read and written at once, without locks.
 
-    Each number is read and written at once, without locks.
-
-    Args:
-        file: Descriptor of a temporary file that both processes map.
+    The child writes the counts of `LiveCounts`, the number of frames (-1 if it is unknown) and whether images still
+    arrive; the parent, also in a signal handler, that it wants the recording to end.
     """
 
-    def __init__(self, file: int) -> None:
-        os.ftruncate(file, 8 * NUMBERS)
-        self._numbers = np.frombuffer(mmap.mmap(file, 8 * NUMBERS), np.float64)
+    arrived: int
+    tracked: int
+    thinned: int
+    lost: int
+    newest: float
+    frame_count: int
+    recording: bool
+    finish: bool
+    _fields_ = (
+        *((name, ctypes.c_int64) for name in ("arrived", "tracked", "thinned", "lost", "frame_count")),
+        *(("newest", ctypes.c_double), ("recording", ctypes.c_bool), ("finish", ctypes.c_bool)),
+    )
 
-    def write(self, counts: LiveCounts | None, frame_count: int | None) -> None:
-        if counts is not None:
-            self._numbers[:5] = counts.arrived, counts.tracked, counts.thinned, counts.lost, counts.newest
-        self._numbers[5] = -1 if frame_count is None else frame_count
-
-    def counts(self, delivered: int) -> LiveCounts:
-        """Return the counts, of which the parent has taken `delivered` frames."""
-        arrived, tracked, thinned, lost = (int(number) for number in self._numbers[:4])
-        return LiveCounts(arrived, tracked, thinned, lost, max(0, tracked - delivered), float(self._numbers[4]))
-
-    @property
-    def frame_count(self) -> int | None:
-        return None if self._numbers[5] < 0 else int(self._numbers[5])
-
-    @property
-    def recording(self) -> bool:
-        """Whether images still arrive."""
-        return bool(self._numbers[7])
-
-    @recording.setter
-    def recording(self, goes_on: bool) -> None:
-        self._numbers[7] = goes_on
-
-    @property
-    def finish(self) -> bool:
-        """Whether the parent wants the recording to end. Setting it is safe in a signal handler."""
-        return bool(self._numbers[6])
-
-    @finish.setter
-    def finish(self, wanted: bool) -> None:
-        self._numbers[6] = wanted
+    @classmethod
+    def of(cls, file: int) -> CountsBoard:
+        """Return the numbers in a temporary file, of which both processes have a descriptor."""
+        os.ftruncate(file, ctypes.sizeof(cls))
+        return cls.from_buffer(mmap.mmap(file, ctypes.sizeof(cls)))
 
 
 class TrackingProcess(Tracker):
@@ -161,7 +139,7 @@ class TrackingProcess(Tracker):
             self._kept = tempfile.TemporaryDirectory(prefix="modp-ti-live-", ignore_cleanup_errors=True)
         self._connection, theirs = Pipe()
         with tempfile.TemporaryFile() as board, theirs:
-            self._board = CountsBoard(board.fileno())
+            self._board = CountsBoard.of(board.fileno())
             self._process = _started([theirs.fileno(), board.fileno()])
         self._interrupt = RecordingInterrupt(self._interrupted)
         self._progress = progress
@@ -212,7 +190,7 @@ class TrackingProcess(Tracker):
 
     @property
     def frame_count(self) -> int | None:
-        return self._board.frame_count
+        return None if self._board.frame_count < 0 else self._board.frame_count
 
     @property
     def unreadable(self) -> Mapping[str, UnreadableImageError]:
@@ -221,7 +199,10 @@ class TrackingProcess(Tracker):
 
     @property
     def live(self) -> LiveCounts | None:
-        return self._board.counts(self._taken) if self._config.source.follows_clock else None
+        b = self._board
+        waiting = max(0, b.tracked - self._taken)
+        counts = LiveCounts(b.arrived, b.tracked, b.thinned, b.lost, waiting, b.newest)
+        return counts if self._config.source.follows_clock else None
 
     def __iter__(self) -> Iterator[Event]:
         """Iterate once over frames and corrections as the tracker delivers them.
