@@ -315,8 +315,8 @@ def thin_picture(
         # A place behind the camera, or next to it, is shown by its direction.
         aside = place[:2] / max(float(np.linalg.norm(place[:2])), 1e-9)
         tail = camera.project(place[None])[0] if place[2] > 0.1 * target[2] else (0.5 + 0.45 * aside) * size
-        ends = [tuple(np.clip(end, 0, size).round().astype(int).tolist()) for end in (tail, head)]
-        cv2.arrowedLine(picture, *ends, ARROW, max(2, camera.width // 200), cv2.LINE_AA, tipLength=0.15)
+        (x0, y0), (x1, y1) = (np.clip(end, 0, size).round().astype(int).tolist() for end in (tail, head))
+        cv2.arrowedLine(picture, (x0, y0), (x1, y1), ARROW, max(2, camera.width // 200), cv2.LINE_AA, tipLength=0.15)
     return picture
 
 
