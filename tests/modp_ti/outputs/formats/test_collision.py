@@ -11,13 +11,14 @@ import pytest
 import trimesh
 import yaml
 from scipy import ndimage
+from skimage.graph import route_through_array
 
 from fields.geometry.se3 import camera_centres
 from modp_ti.outputs.formats.collision import boundary, write_octomap, write_ros_map, write_voxels
 from modp_ti.outputs.formats.mesh import open3d, write_mesh
 from pipelines.surface.free_space import FREE, SOLID, UNKNOWN, VoxelSpace, carved, reached
 from tests.pipelines.surface.test_free_space import looking_around, true_views
-from tests.room import Room
+from tests.room import HIGH, LOW, Room
 
 TURN = np.array([[0.8, 0.6, 0.0], [-0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
 
@@ -110,8 +111,8 @@ def test_the_mesh_is_closed_faces_inwards_and_is_light(tmp_path: Path, space: Vo
         np.testing.assert_allclose(mesh.bounds.mean(axis=0), middle, atol=0.1)
 
 
-def test_nothing_leaves_the_room_and_its_walk_is_found(room: Room) -> None:
-    """A ball of 0.3 m that drops from 1,000 places of the camera, its way, and the way on the map for a robot."""
+def test_nothing_leaves_the_room_and_its_walk_is_found(tmp_path: Path, room: Room) -> None:
+    """A ball of 0.3 m that drops from 1,000 places of the camera, its way, and a robot's way from its first to its last place."""
     poses = looking_around(60)
     way = camera_centres(poses)
     space = carved(true_views(room, poses), [way], TURN, 0.06, 10.0)
@@ -133,7 +134,15 @@ def test_nothing_leaves_the_room_and_its_walk_is_found(room: Room) -> None:
         places[:, 2] -= np.clip(gap, 0.0, None)
     assert places[:, 2].min() - radius > -0.06  # the floor is at 0, to a voxel
     assert np.median(places[:, 2]) < 1.0  # and they have fallen
-    layer = space.index(np.median(way, axis=0)[None])[0, 2]
-    labels, _ = ndimage.label(space.state[:, :, layer] == FREE)
-    along = labels[tuple(space.index(way)[:, :2].T)]
-    assert along[0] > 0 and (along == along[0]).all()
+    write_ros_map(tmp_path, space, float(np.median(way[:, 2])))
+    about = yaml.safe_load((tmp_path / "map.yaml").read_text())
+    picture = cv2.imread(str(tmp_path / "map.pgm"), cv2.IMREAD_UNCHANGED)
+    cost = np.where(ndimage.binary_dilation(picture != 254, iterations=2), -1.0, 1.0)  # a robot of 0.3 m
+    cells = np.floor(((way @ TURN.T)[:, :2] - about["origin"][:2]) / about["resolution"]).astype(int)
+    rows = np.stack([len(picture) - 1 - cells[:, 1], cells[:, 0]], axis=1)
+    path, _ = route_through_array(cost, rows[0], rows[-1])
+    assert (cost[tuple(np.transpose(path))] > 0).all()
+    x, y = np.transpose(path)[::-1]
+    points = np.stack([x + 0.5, len(picture) - 0.5 - y, np.zeros(len(path))], axis=1) * about["resolution"]
+    points = (points + [*about["origin"][:2], np.median(way[:, 2])]) @ TURN
+    assert room.distance(points).min() > radius and ((points > LOW) & (points < HIGH)).all()
