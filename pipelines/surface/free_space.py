@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 from pipelines.surface.fusion import Placed, supporting_views
 
 UNKNOWN, FREE, SOLID = 0, 1, 2
-# A voxel is solid if this number of views end in it, at most one for every SHORT views, and if at most THROUGH times as
-# many see through its centre. It is free if so many see through it.
-LEAST_VIEWS, SHORT, THROUGH = 2, 16, 2.0
+# A voxel is solid if LEAST_ENDS views end in it, and at most THROUGH times as many see through its centre. It is free if
+# LEAST_THROUGH see through it. Of short recordings, one view for every SHORT ones is enough. With 2, 3, 4 and 6 ends, 70,
+# 73, 75 and 78 percent of the demo's solid voxels lie within one voxel of its surface, and 88, 87, 86 and 83 percent of
+# the surface that several frames see are solid.
+LEAST_ENDS, LEAST_THROUGH, SHORT, THROUGH = 4, 2, 16, 2.0
 # What is unknown is free this many voxels around the cameras' paths, since someone carried them; what is solid is not,
 # but for one voxel.
 ROOM = 4
@@ -107,10 +109,10 @@ def carved(
         grid = np.stack(np.meshgrid([layer], *map(np.arange, shape[1:]), indexing="ij"), axis=-1).reshape(-1, 3)
         centres = voxel * (grid + first + 0.5) @ R_grid_world
         seen_through[layer] = supporting_views(centres, near, 0.5 * voxel)[1].reshape(shape[1:])
-    least = max(min(LEAST_VIEWS, len(views) // SHORT), 1)
+    ends, least = (max(min(number, len(views) // SHORT), 1) for number in (LEAST_ENDS, LEAST_THROUGH))
     hit, through = hits.reshape(shape), seen_through
     state = np.where(through >= least, FREE, UNKNOWN).astype(np.uint8)
-    state[(hit >= least) & (through <= THROUGH * hit)] = SOLID
+    state[(hit >= ends) & (through <= THROUGH * hit)] = SOLID
     index = np.floor(passed).astype(np.int64) - first
     around = np.stack(np.meshgrid(*3 * [np.arange(-ROOM, ROOM + 1)]), axis=-1).reshape(-1, 3)
     for step in around[(around**2).sum(axis=1) <= ROOM**2]:
