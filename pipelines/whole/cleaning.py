@@ -30,8 +30,9 @@ GIANT, GIANT_ANGLE = 1.0, 0.5
 NEEDLE, NARROW = 0.1, 20.0
 # Reach from which holes of a depth image are filled [image widths], and the share of it that must be known.
 HOLE, LEAST_KNOWN = 0.05, 0.05
-# Most rounds in which floaters are looked for.
-ROUNDS = 4
+# Rounds in which floaters are looked for, by factors on both errors above. The worst are removed first, since they
+# make what lies behind them a suspect.
+ROUNDS = (4.0, 2.0, 1.0, 1.0)
 
 
 def faults(mapper: OnlineMapper) -> tuple[dict[str, NDArray[np.bool_]], NDArray[np.float64]]:
@@ -53,16 +54,16 @@ def faults(mapper: OnlineMapper) -> tuple[dict[str, NDArray[np.bool_]], NDArray[
     position, count = state["position"].astype(np.float64), len(state["position"])
     sizes = np.sort(np.exp(state["log_scale"].astype(np.float64)), axis=1) / depth
     floaters, outside, shows = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool), np.zeros(count)
-    for _ in range(ROUNDS):
+    for strictness in ROUNDS:
         there = np.flatnonzero(~floaters)
-        suspect, unseen, total = _suspects(mapper, position[there])
+        suspect, unseen, total = _suspects(mapper, position[there], strictness)
         outside[there[unseen]] = True
         shows[there] = total
         mapper.gaussians.load({name: values[there[~suspect]] for name, values in state.items()})
         found = there[suspect][_in_free_space(mapper, position[there[suspect]])]
         floaters[found] = True
         mapper.gaussians.load({name: values[~floaters] for name, values in state.items()})
-        if len(found) == 0:
+        if len(found) == 0 and strictness == ROUNDS[-1]:
             break
     distance = np.full(count, np.inf)
     large = np.flatnonzero(sizes[:, 2] > GIANT)
@@ -82,7 +83,7 @@ def faults(mapper: OnlineMapper) -> tuple[dict[str, NDArray[np.bool_]], NDArray[
 
 
 def _suspects(
-    mapper: OnlineMapper, position: NDArray[np.float64]
+    mapper: OnlineMapper, position: NDArray[np.float64], strictness: float
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.float64]]:
     """Return which of the loaded Gaussians (N,) are suspects, which no keyframe sees, and how much they show (N,)."""
     space = FreeSpace(mapper.renderer, mapper.near)
@@ -103,7 +104,9 @@ def _suspects(
         sight[seen] += (surface > 0) & (z < surface / BEFORE)
     ratio = error / np.maximum(total, 1e-9)
     usual = float(np.median(ratio[total > 0])) if (total > 0).any() else 0.0
-    suspect = (total > 0) & (ratio >= max(FACTOR * usual, WRONG))
+    suspect = (total > 0) & (ratio >= strictness * max(FACTOR * usual, WRONG))
+    if strictness > ROUNDS[-1]:
+        return suspect, (inside == 0) & (shown == 0), total
     suspect |= (total > 0) & (ratio >= LITTLE * usual) & (relative < BEFORE * total)
     suspect |= (shown <= FEW) & (sight >= MANY)
     return suspect, (inside == 0) & (shown == 0), total
