@@ -34,16 +34,12 @@ Output = Annotated[
 def clean(out: Out, output: Output = None, quiet: Quiet = False, as_json: AsJson = False) -> None:
     """Remove floaters, giants, needles and what no frame has seen from a finished map. OUT stays as it is."""
     with outcome(as_json) as result:
+        from modp_ti.engine.cleaned import said
         from modp_ti.engine.edited_run import clean_run
 
         target = _target(out, output, "clean")
         entry = clean_run(out, target, progress_console(quiet))
-        removed = ", ".join(f"{count} {kind}" for kind, count in entry["removed"].items())
-        which = "held-out" if entry["held_out"] else "keyframes'"
-        result.text = (
-            f"written to {target}; removed {removed} of {entry['kept'] + sum(entry['removed'].values())}; "
-            f"{which} PSNR {entry['before']:.2f} dB before, {entry['after']:.2f} dB after"
-        )
+        result.text = f"written to {target}; {said(entry)}"
         result.data = {"output": str(target.absolute()), **entry}
 
 

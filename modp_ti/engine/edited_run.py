@@ -18,13 +18,13 @@ from fields.frames.origin import shifted_poses
 from fields.geometry.se3 import camera_centres
 from fields.runtime.backend import initialise
 from modp_ti.config.scene_file import dump_scene
+from modp_ti.engine.cleaned import cleaned, thinned
 from modp_ti.engine.refined_run import mapper_of, refinable
 from modp_ti.engine.results import OUTDATED
 from modp_ti.files import read_json
 from modp_ti.files.atomic import replace_text
 from modp_ti.files.errors import InputError
 from modp_ti.files.run_folder import appearing, is_run_folder
-from modp_ti.outputs.evaluation import keyframe_psnr, score_frame
 from modp_ti.outputs.formats.splats_ply import check_splats, write_splats
 from modp_ti.outputs.formats.trajectory import write_trajectory
 from modp_ti.outputs.measuring import WORLD, read_world
@@ -32,7 +32,6 @@ from modp_ti.outputs.playback.finished_run import FinishedRun, open_run
 from modp_ti.outputs.playback.run_frames import frames_of, run_settings
 from modp_ti.outputs.progress import ProgressLine
 from modp_ti.outputs.splat_page.page import levelled, moved
-from pipelines.whole.cleaning import faults, harmless
 
 # What the new folder takes over as it is. Scores, pictures and report are of the whole map.
 COPIED = ("trajectory.txt", "frames.json", "exposure.json", "scores.csv", "recording.yaml", "colmap", "masks", WORLD)
@@ -40,10 +39,6 @@ COPIED = ("trajectory.txt", "frames.json", "exposure.json", "scores.csv", "recor
 EDITS = ("cleaned", "cropped", "scaled")
 # Entries of world.json that hold for one position and direction of the world only.
 ON_EARTH = ("axes", "origin", "origin_deviation", "heading_deviation")
-# Loss of held-out quality that removing faults may cost [dB].
-LOSS = 0.05
-# Frames that it is measured on, evenly spaced.
-MEASURED = 32
 
 
 @dataclass(frozen=True)
@@ -107,9 +102,7 @@ def crop_run(folder: Path, output: Path, region: Region) -> dict[str, Any]:
 
 
 def clean_run(folder: Path, output: Path, console: Console | None = None) -> dict[str, Any]:
-    """Write a new output folder with the map of a finished run without its faults, see `pipelines.whole.cleaning`.
-
-    What would cost more than `LOSS` on held-out frames (on keyframes, if none were held out) stays.
+    """Write a new output folder with the map of a finished run without its faults, see `cleaned`.
 
     Args:
         folder: Output folder of the run.
@@ -117,7 +110,7 @@ def clean_run(folder: Path, output: Path, console: Console | None = None) -> dic
         console: Receives progress, None for no output.
 
     Returns:
-        `removed`: numbers of Gaussians by kind, `kept`, and the PSNR `before` and `after` [dB].
+        What was removed, see `cleaned`.
 
     Raises:
         InputError: If there is no finished run, its frames cannot be read again, or the folder cannot be written.
@@ -129,29 +122,10 @@ def clean_run(folder: Path, output: Path, console: Console | None = None) -> dic
     except RuntimeError as error:
         raise InputError(str(error)) from None
     mapper = mapper_of(run, config, line)
-    held_out = run.record.held_out[:: -(-len(run.record.held_out) // MEASURED) or 1]
-    frames = list(frames_of(run, held_out, line.prepare))
-    views = list(mapper.keyframes)[:: -(-len(mapper.keyframes) // MEASURED)]
-    exposures = [mapper.keyframes.exposure_at(frame.index) for frame in frames]
-
-    def score(kept: NDArray[np.bool_]) -> float:
-        mapper.gaussians.load({name: values[kept] for name, values in run.gaussians.items()})
-        scores = [
-            score_frame(mapper, frame, frame.T_camera_world, "", None, exposure)[0].psnr
-            for frame, exposure in zip(frames, exposures, strict=True)
-        ]
-        return float(np.mean(scores or [keyframe_psnr(mapper, view) for view in views]))
-
+    frames = frames_of(run, thinned(run.record.held_out), line.prepare)
+    held_out = [(frame, frame.T_camera_world) for frame in frames]
     with line.working("looking for faults"):
-        taken, before, after = harmless(*faults(mapper), score, LOSS)
-    kept = ~np.any(list(taken.values()), axis=0)
-    entry = {
-        "removed": {kind: int(mask.sum()) for kind, mask in taken.items()},
-        "kept": int(kept.sum()),
-        "held_out": bool(frames),
-        "before": round(before, 4),
-        "after": round(after, 4),
-    }
+        kept, entry = cleaned(mapper, held_out)
     with _written(run, _those(run, kept), output, {"cleaned": entry}):
         pass
     return entry

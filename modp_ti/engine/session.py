@@ -190,6 +190,7 @@ def _write_figures(finished: FinishedMap, results: Results, scores: list[FrameSc
         "lpips_note": stream.no_lpips,
         "breakdown_percent": finished.breakdown,
         "further_maps": tracker.further_maps,
+        "clean": finished.cleaned,
         **metrics_of(scores, versions, fitted, frames, pipeline.stopwatch.seconds | {"total": run.clock.total}),
         "retention": retention(run.record.frames, scores),
         **run.conductor.metrics(),

@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, replace
+from typing import Any
 
 from fields.frames.pose_correction import PoseCorrection
 from fields.frames.tracked_frame import TrackedFrame
@@ -15,6 +16,7 @@ from fields.geometry.camera import PinholeCamera
 from fields.runtime import process
 from fields.runtime.backend import describe, initialise
 from modp_ti.config.settings import SceneConfig
+from modp_ti.engine.cleaned import cleaned, said, thinned
 from modp_ti.engine.interruption import Interruption
 from modp_ti.engine.mapper import Mapper, build_mapper
 from modp_ti.engine.parts import MergedParts
@@ -332,11 +334,13 @@ class FinishedMap:
         stream: The run with its mapped stream.
         versions: The map before refinement and, if the settings ask for it, after. The last version is final.
         breakdown: Share of each stage in the time of mapping [%].
+        cleaned: What `mapping.clean` has removed, see `cleaned`; None if it has not looked.
     """
 
     stream: MappedStream
     versions: dict[str, MapVersion]
     breakdown: dict[str, float]
+    cleaned: dict[str, Any] | None = None
 
     @property
     def last(self) -> MapVersion:
@@ -381,4 +385,24 @@ def finish_map(stream: MappedStream) -> FinishedMap:
             finally:
                 line.stop()
             versions["refined"] = mapper.version()
-    return FinishedMap(stream, versions, breakdown)
+        entry = None
+        if config.mapping.clean == "auto" and config.mode != "offline":
+            stage, last = list(versions.items())[-1]
+            with line.working("looking for faults"):
+                entry = _clean(stream, last)
+            versions[stage] = replace(mapper.version(), view_renders=last.view_renders)
+    return FinishedMap(stream, versions, breakdown, entry)
+
+
+def _clean(stream: MappedStream, version: MapVersion) -> dict[str, Any] | None:
+    """Remove the faults of the finished map, and return what `cleaned` says; None if parts of it are on disk."""
+    run, frames, mapper = stream.run, stream.mapper.frames, stream.mapper.online
+    if len(mapper.gaussians) < len(version.gaussians["position"]):
+        run.say("mapping.clean: the map is larger than memory, and stays as it is")
+        return None
+    held_out = set(thinned([index for index, held in zip(frames.index, frames.held_out, strict=True) if held]))
+    poses = dict(zip(frames.index, version.trajectory, strict=True))
+    again = frames.again(run.tracker) if held_out else ()
+    _, entry = cleaned(mapper, [(frame, poses[frame.index]) for frame in again if frame.index in held_out])
+    run.say(said(entry))
+    return entry

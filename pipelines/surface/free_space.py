@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from pipelines.surface.fusion import Placed, supporting_views
 
 UNKNOWN, FREE, SOLID = 0, 1, 2
-# A voxel is solid if LEAST_ENDS views end in it, and at most THROUGH times as many see through its centre. It is free if
-# LEAST_THROUGH see through it. Of short recordings, one view for every SHORT ones is enough. With 2, 3, 4 and 6 ends, 70,
-# 73, 75 and 78 percent of the demo's solid voxels lie within one voxel of its surface, and 88, 87, 86 and 83 percent of
-# the surface that several frames see are solid.
+# A voxel is solid if LEAST_ENDS views end in it, and at most THROUGH times as many see through its centre. It is free
+# if LEAST_THROUGH see through it. Of short recordings, one view for every SHORT ones is enough. With 2, 3, 4 and 6
+# ends, 70, 73, 75 and 78 percent of the demo's solid voxels lie within one voxel of its surface, and 88, 87, 86 and 83
+# percent of the surface that several frames see are solid.
 LEAST_ENDS, LEAST_THROUGH, SHORT, THROUGH = 4, 2, 16, 2.0
 # What is unknown is free this many voxels around the cameras' paths, since someone carried them; what is solid is not,
 # but for one voxel.

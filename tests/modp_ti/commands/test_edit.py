@@ -21,7 +21,8 @@ from modp_ti.outputs.playback.finished_run import open_run
 from modp_ti.outputs.playback.map_renderer import MapRenderer, start_device
 from modp_ti.outputs.splat_page.page import levelled
 from pipelines.whole.cleaning import harmless
-from tests.room import Room
+from tests.modp_ti.runs import SHORT_RUN, finished_run
+from tests.room import Room, RoomRecording
 
 pytestmark = pytest.mark.slow
 PLANTED = 6
@@ -86,6 +87,20 @@ def test_planted_splats_are_removed_and_those_of_surfaces_stay(planted: Path, tm
     assert found["after"] > found["before"]
     assert found["kept"] + sum(found["removed"].values()) == len(stays) and found["kept"] == stays.sum()
     assert files(planted) == before
+
+
+def test_a_run_that_cleans_its_map_ends_with_what_clean_leaves(
+    finished: Path, room_recording: RoomRecording, tmp_path: Path
+) -> None:
+    command("clean", finished, "-o", tmp_path / "clean")
+    room_recording.write(tmp_path / "run")
+    scene = SHORT_RUN.replace("mapping: {", "mapping: {clean: auto, ")
+    out = finished_run(tmp_path / "run", scene, "PSNR of held-out frames")
+    one, other = (open_run(folder).gaussians for folder in (tmp_path / "clean", out))
+    for name in one:
+        np.testing.assert_array_equal(one[name], other[name])
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["gaussians"] == metrics["clean"]["kept"] == len(one["position"])
 
 
 def test_every_command_takes_the_new_folder(planted: Path, tmp_path: Path) -> None:

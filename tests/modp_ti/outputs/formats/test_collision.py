@@ -112,7 +112,7 @@ def test_the_mesh_is_closed_faces_inwards_and_is_light(tmp_path: Path, space: Vo
 
 
 def test_nothing_leaves_the_room_and_its_walk_is_found(tmp_path: Path, room: Room) -> None:
-    """A ball of 0.3 m that drops from 1,000 places of the camera, its way, and a robot's way from its first to its last place."""
+    """A ball of 0.3 m that drops from 1,000 places of the camera, its way, and the way that a robot would plan."""
     poses = looking_around(60)
     way = camera_centres(poses)
     space = carved(true_views(room, poses), [way], TURN, 0.06, 10.0)
@@ -143,6 +143,6 @@ def test_nothing_leaves_the_room_and_its_walk_is_found(tmp_path: Path, room: Roo
     path, _ = route_through_array(cost, rows[0], rows[-1])
     assert (cost[tuple(np.transpose(path))] > 0).all()
     x, y = np.transpose(path)[::-1]
-    points = np.stack([x + 0.5, len(picture) - 0.5 - y, np.zeros(len(path))], axis=1) * about["resolution"]
-    points = (points + [*about["origin"][:2], np.median(way[:, 2])]) @ TURN
+    places = np.stack([x + 0.5, len(picture) - 0.5 - y], axis=1) * about["resolution"] + about["origin"][:2]
+    points = np.column_stack([places, np.full(len(path), np.median(way[:, 2]))]) @ TURN
     assert room.distance(points).min() > radius and ((points > LOW) & (points < HIGH)).all()
