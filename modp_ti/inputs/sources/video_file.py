@@ -117,8 +117,9 @@ class VideoFile(ImageSource):
         return image
 
     def close(self) -> None:
-        """Close the file."""
-        self._decoder.close()
+        """Close the file, once another thread that is reading from it has its frame."""
+        with self._lock:
+            self._decoder.close()
 
     def _opened(self, in_threads: bool = False) -> _Decoder:
         try:
