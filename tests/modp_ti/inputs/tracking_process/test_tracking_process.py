@@ -25,7 +25,6 @@ from modp_ti.inputs.sources import FrameReader
 from modp_ti.inputs.sources.live import list_frames
 from modp_ti.inputs.tracking_process import TrackingProcess
 from tests.modp_ti.inputs.mjpeg_camera import MjpegCamera, encoded
-from tests.modp_ti.inputs.tracking_process.frames import assert_same
 from tests.patience import PATIENCE
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("interruptible")]
@@ -63,6 +62,19 @@ def started():
     for tracker in made:
         tracker.close()
         tracker.close()  # a second time is no fault
+
+
+def assert_same(one: TrackedFrame, other: TrackedFrame) -> None:
+    """Every byte of two frames is the same, except for the time of arrival."""
+    for name in ("index", "timestamp", "name", "camera", "held_out"):
+        assert getattr(one, name) == getattr(other, name), name
+    for name in ("image", "T_camera_world", "rgba", "mask", "vignette"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name), name)
+    for name in ("xyz", "pixels", "ids"):
+        np.testing.assert_array_equal(getattr(one.points, name), getattr(other.points, name), name)
+    for a, b in zip(one.pyramid, other.pyramid, strict=True):
+        assert a.camera == b.camera
+        np.testing.assert_array_equal(a.rgba, b.rgba)
 
 
 def wait_until(condition) -> None:
