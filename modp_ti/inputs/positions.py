@@ -27,7 +27,7 @@ from modp_ti.files.reading import read_bytes, read_text, reading
 from modp_ti.inputs.bags.bag import Bag, is_bag
 from modp_ti.inputs.bags.transforms import seconds
 from modp_ti.inputs.sources.image_header import photo_position
-from modp_ti.inputs.sources.video_file import CONTAINERS
+from modp_ti.inputs.sources.video_file import CONTAINERS, VIDEO_SUFFIXES
 
 # Streams of GPMF with the columns of latitude, longitude and height: up to HERO10, from HERO11 on, of drones.
 FIXES = {b"GPS5": (0, 1, 2), b"GPS9": (0, 1, 2), b"GLPI": (1, 2, 3)}
@@ -89,7 +89,7 @@ def recorded_positions(path: Path, names: Sequence[str]) -> Positions:
 def recorded_gravity(path: Path, times: NDArray[np.float64]) -> NDArray[np.float64] | None:
     """Return the direction of gravity (F, 3) in the images of a video at times (F,) [s]; None if it holds none."""
     with reading(path):
-        samples = [*_telemetry(path)] if path.is_file() and not is_bag(path) else []
+        samples = [*_telemetry(path)] if path.is_file() else []
     gravity, turn = (np.array([row for key, row in samples if key == wanted]) for wanted in (GRAVITY, TURN))
     if len(gravity) == 0 or not gravity[:, 1:].any() or not gravity[0, 0] <= times.max() <= gravity[-1, 0] + 1.0:
         return None
@@ -176,9 +176,11 @@ def _began(video: Path) -> float:
 
 
 def _telemetry(video: Path) -> Iterator[tuple[bytes, tuple[float, ...]]]:
-    """Yield key, and time [s] and values of the samples of GPMF in a video."""
+    """Yield key, and time [s] and values of the samples of GPMF in a video; none of other files."""
     import av
 
+    if video.suffix.lower() not in VIDEO_SUFFIXES:
+        return
     options = {"format_whitelist": CONTAINERS, "protocol_whitelist": "file"}
     with av.open(f"file:{video}", options=options, metadata_errors="replace") as container:
         for packet in container.demux(container.streams.data):

@@ -104,24 +104,27 @@ def georeference(run: FinishedRun, positions: Positions, down: NDArray[np.float6
         InputError: If too few positions are of the run's frames, or they do not tell the scale.
     """
     centres, geodetic = _centres_at(run, positions)
-    if len(centres) > BASELINES:
-        origin = np.median(geodetic, axis=0)
-        target = (ecef(geodetic) - ecef(origin)) @ axes_at(origin)
-        s, R, t, error, weight = robust_similarity(centres, target, down)
-        if down is None:
-            share = np.linalg.svd((centres - centres.mean(axis=0)) * s / np.sqrt(len(centres)))[1]
-            level, held = share[1] < SPREAD * error, levelled(run).R[1]
-            s, R, t, error, weight = robust_similarity(centres, target, held) if level else (s, R, t, error, weight)
-        if _baselines(s * centres, error) >= BASELINES:
-            residual = target - s * centres @ R.T - t
-            near = weight > 0.5
-            spread = s * np.sqrt(((centres[near] - centres[near].mean(axis=0)) ** 2).mean(axis=0).sum())
-            place = float(error * np.sqrt(_together(residual[near]) / near.sum()))
-            return GeoReference(s, R, t, float(place / spread), origin, place, error, len(centres))
-    raise InputError(
-        f"{run.folder}: its {len(centres)} GPS positions do not tell the scale: it takes {BASELINES} ways between "
-        "frames that are longer than the positions' error; give a length instead (--from, --to, --metres)"
-    )
+    if len(centres) <= BASELINES:
+        spans = [f"{t[0]:.1f} to {t[-1]:.1f} s" for t in (run.timestamps, positions.times) if t is not None]
+        clocks = f", of {spans[0]}; the positions are of {spans[1]} (--gps-offset)" if len(spans) > 1 else ""
+        raise InputError(f"{run.folder}: only {len(centres)} GPS positions are of its frames{clocks}")
+    origin = np.median(geodetic, axis=0)
+    target = (ecef(geodetic) - ecef(origin)) @ axes_at(origin)
+    s, R, t, error, weight = robust_similarity(centres, target, down)
+    if down is None:
+        share = np.linalg.svd((centres - centres.mean(axis=0)) * s / np.sqrt(len(centres)))[1]
+        if share[1] < SPREAD * error:
+            s, R, t, error, weight = robust_similarity(centres, target, levelled(run).R[1])
+    if _baselines(s * centres, error) < BASELINES:
+        raise InputError(
+            f"{run.folder}: its {len(centres)} GPS positions do not tell the scale: it takes {BASELINES} ways between "
+            f"frames that are longer than their error ({error:.2g} m); give a length instead (--from, --to, --metres)"
+        )
+    residual = target - s * centres @ R.T - t
+    near = weight > 0.5
+    spread = s * np.sqrt(((centres[near] - centres[near].mean(axis=0)) ** 2).mean(axis=0).sum())
+    place = float(error * np.sqrt(_together(residual[near]) / near.sum()))
+    return GeoReference(s, R, t, float(place / spread), origin, place, error, len(centres))
 
 
 def _centres_at(run: FinishedRun, positions: Positions) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
