@@ -203,7 +203,7 @@ def _written(
         if output.resolve() == run.folder.resolve() or not {*EDITS} & there.keys():
             raise InputError(f"{output}: holds the map of a run, which stays as it is: name another folder (-o)")
     config = run_settings(run).model_copy(update={"output": output})
-    with appearing(output, (*OUTDATED, WORLD)) as folder:
+    with appearing(output, OUTDATED) as folder:
         for name in COPIED:
             source = run.folder / name
             if source.is_dir():

@@ -28,6 +28,7 @@ from modp_ti.outputs.evaluation import FrameScore, MapVersion, summary
 from modp_ti.outputs.formats.dataset import image_names, write_image
 from modp_ti.outputs.formats.run_files import NOT_ALWAYS, write_map, write_scores
 from modp_ti.outputs.formats.splats_ply import check_splats
+from modp_ti.outputs.measuring import WORLD, read_world
 from modp_ti.outputs.report.page import Album, ReportedRun, write_report
 from modp_ti.outputs.report.record import RunRecord
 from modp_ti.outputs.report.where_wrong import ErrorSurvey, Motion, Needles
@@ -43,7 +44,7 @@ MAPS = ("online", "refined", "offline")
 # Most frames that are asked where the map is thin.
 LOOKS = 100
 # What not every run has, or is only written after its scores.
-OUTDATED = (*NOT_ALWAYS, "metrics.json", "scores.csv", "report.html", "renders", "session.zip")
+OUTDATED = (*NOT_ALWAYS, WORLD, "metrics.json", "scores.csv", "report.html", "renders", "session.zip")
 
 
 class Results:
@@ -80,6 +81,10 @@ class Results:
         with appearing(self.config.output, OUTDATED) as self.folder:
             yield
             dump_scene(self.config, self.folder / "config.yaml")
+            world = {"unit": "m", "by": "the recording's poses"} if self.config.tracker.in_metres else {}
+            world = world if self.config.onto is None else read_world(self.config.onto)
+            if world:
+                replace_text(self.folder / WORLD, json.dumps(world, indent=2) + "\n")
 
     @contextmanager
     def writing_figures(self) -> Iterator[None]:

@@ -39,6 +39,7 @@ class CaptureSettings(PosesSettings):
     """
 
     brings_cameras: ClassVar[bool] = True
+    in_metres: ClassVar[bool] = True
     holds: ClassVar[str]
     """What such a capture holds, for error messages."""
 

@@ -42,6 +42,8 @@ class TrackerSettings(StrictModel):
     """Whether the tracker works on a live `source.stream`, whose images are not known in advance."""
     is_live: ClassVar[bool] = False
     """Whether the frames arrive from another program and cannot be read again after the run."""
+    in_metres: ClassVar[bool] = False
+    """Whether the poses are in metres, as those of phones, depth cameras and robots, and so the map is."""
     places_panoramas: ClassVar[bool] = False
     """Whether the tracker has poses of images that see all round, which `source.panorama` cuts into faces."""
     source_kind: ClassVar[str] = ""

@@ -58,6 +58,7 @@ class Transforms:
 class AriaSettings(TimedPosesSettings):
     """Output of Project Aria's machine perception services (MPS)."""
 
+    in_metres: ClassVar[bool] = True
     source_kind: ClassVar[str] = "vrs"
     file_suffixes: ClassVar[Sequence[str]] = (".vrs",)
 

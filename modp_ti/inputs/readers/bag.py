@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 class BagSettings(PosesSettings):
     """The poses of a ROS bag."""
 
+    in_metres: ClassVar[bool] = True
     file_suffixes: ClassVar[Sequence[str]] = SUFFIXES
 
     kind: Literal["bag"] = "bag"

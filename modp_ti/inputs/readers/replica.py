@@ -32,6 +32,7 @@ CAMERA = PinholeCamera(600.0, 600.0, 600.0, 340.0, 1200, 680)
 class ReplicaSettings(GivenPosesSettings):
     """The `traj.txt` of a Replica sequence."""
 
+    in_metres: ClassVar[bool] = True
     pose_files: ClassVar[Sequence[str]] = ("traj.txt",)
 
     kind: Literal["replica"] = "replica"

@@ -32,6 +32,7 @@ class SevenScenesSettings(GivenPosesSettings):
     """The pose files of Microsoft's 7-Scenes."""
 
     # The files contain noisy poses of the depth camera.
+    in_metres: ClassVar[bool] = True
     adjusts_by_default: ClassVar[bool] = True
     pose_files: ClassVar[Sequence[str]] = ("frame-*.pose.txt", "poses/frame-*.pose.txt")
 
