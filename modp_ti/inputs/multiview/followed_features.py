@@ -22,10 +22,6 @@ CORNERS = 800  # corners tracked at a time
 REFILL_BELOW = 0.8  # share of CORNERS below which new ones are detected
 EPIPOLAR_BAND = 3.0  # largest distance [px] from the epipolar line, for exact poses
 
-# Frame pairs that are tested to decide whether a sequence is a video, and the share of corners that must be tracked.
-SAMPLES = 8
-SURVIVING = 0.5
-
 
 @dataclass
 class _PosedFrame(LocalisedFrame):
@@ -126,21 +122,3 @@ def follow_features(
         if progress is not None:
             progress("following features", done + 1, len(chain))
     return Observations(*map(np.concatenate, zip(*seen, strict=True)))
-
-
-def looks_like_video(images: ImageSource, frames: Sequence[PosedImage], solves: NDArray[np.bool_]) -> bool:
-    """Whether corners can be tracked between neighbouring frames, tested at a few places of the sequence.
-
-    Args:
-        images: Source of the images.
-        frames: The F frames with their poses.
-        solves: (F,) False for held-out frames, which are not used.
-    """
-    chain = np.flatnonzero(solves)
-    shares = []
-    for at in np.unique(np.linspace(0, len(chain) - 2, SAMPLES).astype(int)) if len(chain) > 1 else ():
-        one, other = (_read(images, frames, index) for index in chain[at : at + 2].tolist())
-        if one.refill(0):
-            other.follow(one, EPIPOLAR_BAND)
-            shares.append(len(other.ids) / len(one.ids))
-    return bool(shares) and float(np.median(shares)) >= SURVIVING

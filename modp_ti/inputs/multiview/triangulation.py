@@ -17,7 +17,7 @@ from modp_ti.inputs.multiview.features import (
     feature_tracks,
     match_features,
 )
-from modp_ti.inputs.multiview.followed_features import EPIPOLAR_BAND, follow_features, looks_like_video
+from modp_ti.inputs.multiview.followed_features import EPIPOLAR_BAND, follow_features
 from modp_ti.inputs.multiview.points_and_poses import adjusted_poses, solve_points
 from modp_ti.inputs.multiview.reprojection import Observations, point_errors
 from modp_ti.inputs.protocol import Progress
@@ -33,6 +33,8 @@ MAX_TURN = 45.0  # largest angle in degrees between the optical axes of matched 
 # Up to this many frames, SIFT features are always matched: it takes little time, and the frames may be far apart.
 FEW_FRAMES = 60
 FEATURES_OF_MANY_FRAMES = 1000
+# Corners are followed where each is found in so many frames in the mean: where half are found again in the next one.
+FOLLOWED = 2.0
 
 # For poses that are adjusted: largest distance [px] of features from the epipolar line, and largest reprojection error
 # in each round, before and after revisited places have been matched.
@@ -119,8 +121,8 @@ def _median_error(poses: NDArray[np.float64], seen: Observations, solves: NDArra
 class _Sequence:
     """Frames whose features are observed.
 
-    `poses` are the given ones, of a world that begins near the cameras. `follows`: corners are tracked from frame to
-    frame, instead of matching SIFT features.
+    `poses` are the given ones, of a world that begins near the cameras. `follows`, once they are observed: corners are
+    tracked from frame to frame, instead of matching SIFT features.
     """
 
     def __init__(
@@ -131,15 +133,19 @@ class _Sequence:
         poses = np.stack([frame.T_camera_world for frame in frames])
         self._origin = far_centre(poses)
         self.poses = shifted_poses(poses, -self._origin)
-        self.follows = len(frames) > FEW_FRAMES and looks_like_video(images, frames, solves)
+        self.follows = False
 
     def seen(self, band: float) -> Observations:
         """Observations of the frames, from tracked corners or matched features."""
-        if not self.follows:
-            count = len(self._frames)
-            most = MAX_FEATURES if count <= FEW_FRAMES else FEATURES_OF_MANY_FRAMES
-            return self.matched(self.poses, np.arange(count), most, NEIGHBOURS, band)
-        return follow_features(self._images, self._frames, self._solves, self._progress, band)
+        count = len(self._frames)
+        if count > FEW_FRAMES:
+            seen = follow_features(self._images, self._frames, self._solves, self._progress, band)
+            used = seen.point[self._solves[seen.frame]]
+            self.follows = len(used) > 0 and len(used) >= FOLLOWED * len(np.unique(used))
+            if self.follows:
+                return seen
+        most = MAX_FEATURES if count <= FEW_FRAMES else FEATURES_OF_MANY_FRAMES
+        return self.matched(self.poses, np.arange(count), most, NEIGHBOURS, band)
 
     def matched(
         self, poses: NDArray[np.float64], views: NDArray[np.int64], most: int, neighbours: int, band: float
