@@ -18,7 +18,7 @@ from modp_ti.files import reading
 from modp_ti.files.errors import InputError, UnreadableImageError
 from modp_ti.files.file_tree import SETTING, FileTree, open_tree
 from modp_ti.inputs.capture import Capture, CapturedFrame
-from modp_ti.inputs.depth_maps import depth_points
+from modp_ti.inputs.depth_maps import MOST_POINTS, depth_points
 from modp_ti.inputs.posed_recording import PosedRecording, StoredView
 from modp_ti.inputs.reader import PosesSettings, in_a_sentence, kind_of
 from modp_ti.inputs.replay import Unreadable
@@ -137,7 +137,9 @@ class DepthCaptureSettings(CaptureSettings):
         description="take the tracked points from the depth maps, where there are some; false, and with `adjust`: "
         "triangulate them",
     )
-    max_points: int = Field(default=400, ge=10, description="largest number of points of a frame from its depth map")
+    max_points: int = Field(
+        default=MOST_POINTS, ge=10, description="largest number of points of a frame from its depth map"
+    )
     max_depth: float = Field(default=5.0, gt=0, description="largest depth [m] that is used")
     depth_deviation: float = Field(default=0.02, gt=0, description="standard deviation of a depth [share of it]")
 

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import re
+from bisect import bisect_left
+from collections.abc import Sequence
 from functools import partial
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +24,13 @@ from modp_ti.inputs.sources.undistortion import Undistorter
 # Where the depths of a pixel and its eight neighbours differ by more than this share, the pixel lies on an edge: the
 # sensor blends what is before and behind it.
 EDGE = 0.05
+# Largest number of points that a depth map gives a frame. No two frames have one in common, so that more say little of
+# the others.
+MOST_POINTS = 400
+# The last number in a name; by how much those of an image and its depth picture may differ; and no depth.
+NUMBER = re.compile(r"[0-9]+(?:\.[0-9]+)?(?=[^0-9]*$)")
+LATEST = 0.04
+UNKNOWN = 65535
 
 
 def read_millimetres(tree: FileTree, frame: CapturedFrame, least: int = 0) -> DepthMap:
@@ -88,11 +99,65 @@ def depth_points(
     if depth.camera is not None:
         stored = camera.project(in_camera)
     assert captured.T_camera_world is not None
-    T_world_camera = inverse_se3(captured.T_camera_world)
+    stored = turn.pixels(stored, camera.width, camera.height)
+    return _observed(in_camera, stored, captured.T_camera_world, frame, index)
+
+
+def depth_pictures(folder: Path, images: Sequence[str]) -> dict[str, str]:
+    """Return the depth picture of images by name: that with the number in its name that is nearest to the image's.
+
+    The number is the last one in a name, which may be a time stamp. It must agree within `LATEST`. Images without one
+    are left out.
+    """
+    pictures = {number: name for name in FileTree(folder).listed() if (number := _number(name)) is not None}
+    numbers, found = sorted(pictures), {}
+    for image in images:
+        number = _number(image)
+        if number is None or not numbers:
+            continue
+        after = bisect_left(numbers, number)
+        apart, nearest = min((abs(other - number), other) for other in numbers[max(after - 1, 0) : after + 1])
+        if apart <= LATEST:
+            found[image] = pictures[nearest]
+    return found
+
+
+def _number(name: str) -> float | None:
+    found = NUMBER.search(PurePosixPath(name).stem)
+    return None if found is None else float(found[0])
+
+
+def points_of_picture(file: Path, frame: PosedImage, index: int, scale: float, farthest: float) -> SparsePoints:
+    """Take depths from all over a depth picture, which is registered to an image, as the image's tracked points.
+
+    Args:
+        file: The picture. Its values 0 and 65535 mean that a depth is not known.
+        frame: The image.
+        index: Position of the frame, which decides the sample and the ids of the points.
+        scale: Value of the picture for a depth of one unit of the poses.
+        farthest: Largest depth that is used [units of the poses].
+
+    Raises:
+        OSError: If the picture is missing or damaged.
+    """
+    values = _decoded(FileTree(file.parent), file.name)
+    depth = DepthMap(np.divide(values, scale, dtype=np.float32), (values > 0) & (values < UNKNOWN))
+    in_camera, stored = sampled_points(depth, frame.undistorter, index, MOST_POINTS, farthest)
+    return _observed(in_camera, stored, frame.T_camera_world, frame, index)
+
+
+def _observed(
+    in_camera: NDArray[np.float64],
+    stored: NDArray[np.float64],
+    T_camera_world: NDArray[np.float64],
+    frame: PosedImage,
+    index: int,
+) -> SparsePoints:
+    """Return points (N, 3) of a camera, at pixels (N, 2) of the stored image, as those of the delivered frame."""
+    T_world_camera = inverse_se3(T_camera_world)
     xyz = in_camera @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
-    pixels = frame.undistorter.points(turn.pixels(stored, camera.width, camera.height))
     ids = index * IDS_PER_FRAME + np.arange(len(xyz), dtype=np.int64)
-    return points_inside(xyz, pixels, ids, frame.undistorter, frame.T_camera_world)
+    return points_inside(xyz, frame.undistorter.points(stored), ids, frame.undistorter, frame.T_camera_world)
 
 
 def sampled_points(

@@ -11,8 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, Field, model_validator
 
+from fields.frames.tracked_frame import SparsePoints
 from modp_ti.files.errors import InputError
 from modp_ti.files.file_tree import FileTree
+from modp_ti.files.reading import reading
+from modp_ti.inputs.depth_maps import depth_pictures, points_of_picture
 from modp_ti.inputs.point_cloud import read_point_file, spread_points
 from modp_ti.inputs.posed_recording import PosedRecording
 from modp_ti.inputs.protocol import Progress, Tracker
@@ -221,6 +224,19 @@ class GivenPosesSettings(RecordedSettings):
     max_points: int = Field(
         default=2000, ge=10, description="largest number of points of a frame that are taken from `points`"
     )
+    depth: Path | None = Field(
+        default=None,
+        description="folder of depth pictures (16 bits, one channel, registered to the images), whose depths are the "
+        "tracked points; an image gets that with the number in its name that is nearest to its own",
+    )
+    depth_scale: float = Field(
+        default=1000.0,
+        gt=0,
+        description="value of these pictures for a depth of 1 in the units of the poses: 5000 for TUM, 6553.5 for "
+        "Replica",
+    )
+    max_depth: float = Field(default=5.0, gt=0, description="largest depth that is used, in these units")
+    depth_deviation: float = Field(default=0.02, gt=0, description="standard deviation of a depth [share of it]")
 
     @property
     def adjusts(self) -> bool:
@@ -228,9 +244,11 @@ class GivenPosesSettings(RecordedSettings):
         return self.adjusts_by_default if self.adjust is None else self.adjust
 
     @model_validator(mode="after")
-    def _only_triangulated_points_can_adjust(self) -> GivenPosesSettings:
-        if self.adjust and self.points is not None:
-            raise ValueError("tracker.adjust cannot be used with tracker.points; remove one of them")
+    def _points_come_from_one_place(self) -> GivenPosesSettings:
+        given = {"points": self.points, "depth": self.depth, "adjust": self.adjust or None}
+        several = [f"tracker.{name}" for name, value in given.items() if value is not None]
+        if len(several) > 1:
+            raise ValueError(f"{several[-1]} cannot be used with {several[0]}; remove one of them")
         return self
 
     def give(self, recording: PosedRecording, poses: Mapping[str, NDArray[np.float64]]) -> None:
@@ -255,10 +273,30 @@ class GivenPosesSettings(RecordedSettings):
                     f"{self.points}: none of its {len(xyz)} points is seen by any of the {len(recording.frames)} "
                     "frames: points and poses must be of one world, poses camera to world (tracker.points)"
                 )
+        elif self.depth is not None:
+            self._give_depths(recording, self.depth)
         elif self.adjusts:
             recording.adjust()
         else:
             recording.triangulate()
+
+    def _give_depths(self, recording: PosedRecording, folder: Path) -> None:
+        """Give each frame points of its depth picture."""
+        pictures, points = depth_pictures(folder, [frame.name for frame in recording.frames]), []
+        for index, frame in enumerate(recording.frames):
+            if frame.name not in pictures:
+                points.append(SparsePoints())
+                continue
+            file = folder / pictures[frame.name]
+            with reading(file, " (tracker.depth)"):
+                points.append(points_of_picture(file, frame, index, self.depth_scale, self.max_depth))
+        given = iter(points)
+        if not recording.add_points(lambda _: next(given), self.depth_deviation):
+            raise InputError(
+                f"{folder}: none of its depth pictures has the number of an image and a depth of at most "
+                f"{self.max_depth:g}: check tracker.depth, and tracker.depth_scale ({self.depth_scale:g})"
+            )
+        recording.notes.append(f"{folder}: points of depth pictures for {len(pictures)} of {len(points)} images")
 
     def give_by_number(
         self,

@@ -57,7 +57,15 @@ SPOILT: dict[str, Corruption] = {
 }
 # Files without which the rest is of use, if they are missing or hold nothing.
 OPTIONAL = ("points3D.txt", "points3D.bin", "semidense_points.csv.gz", "semidense_observations.csv", "1.pose.txt")
-OPTIONAL += ("frame_00003.json", "depth_00003.png", "1733333.json", "pose/1.txt", "depth/1.png", ".pincam")
+OPTIONAL += (
+    "frame_00003.json",
+    "depth_00003.png",
+    "depth000001.png",
+    "1733333.json",
+    "pose/1.txt",
+    "depth/1.png",
+    ".pincam",
+)
 OPTIONAL += (
     "intrinsic_depth.txt",
     "masks/frame-000001.color.png",

@@ -155,6 +155,7 @@ SAMPLES = {
     "orbslam3": Sample(trackers.write_orbslam3, ("CameraTrajectory.txt",)),
     "tum_rgbd": Sample(trackers.write_tum_rgbd, ("rgb.txt",)),
     "replica": Sample(trackers.write_replica, ("traj.txt",)),
+    "replica_depth": Sample(trackers.write_replica_depth, ("depth/depth000001.png",)),
     "matrices": Sample(trackers.write_matrices, ("poses.txt",)),
     "tanksandtemples": Sample(trackers.write_log, ("scene.log",)),
     "sevenscenes": Sample(trackers.write_sevenscenes, ("seq/frame-000001.pose.txt",)),

@@ -160,6 +160,17 @@ def write_replica(folder: Path, filmed: Filmed) -> None:
     write_scene(folder, "kind: replica, points: points.txt", f"path: ., kind: replica, {intrinsics(filmed)}")
 
 
+def write_replica_depth(folder: Path, filmed: Filmed) -> None:
+    """With depth pictures, registered and smaller, in the units of Replica."""
+    write_replica(folder, filmed)
+    (folder / "points.txt").unlink()
+    for place, view in enumerate(filmed.views):
+        values = np.round(6553.5 * view.depth_map()).astype(np.uint16)
+        write_image(folder / f"depth/depth{place:06d}.png", values)
+    tracker = "kind: replica, depth: depth, depth_scale: 6553.5"
+    write_scene(folder, tracker, f"path: ., kind: replica, {intrinsics(filmed)}")
+
+
 def write_matrices(folder: Path, filmed: Filmed) -> None:
     write_images(folder, filmed)
     write_text(folder / "poses.txt", [" ".join(rows_of(view.T_world_camera[:3])) for view in filmed.views])

@@ -24,7 +24,7 @@ from modp_ti.inputs.bags.messages import (
 )
 from modp_ti.inputs.bags.transforms import FrameTree, clean, seconds
 from modp_ti.inputs.capture import DepthMap
-from modp_ti.inputs.depth_maps import sampled_points
+from modp_ti.inputs.depth_maps import MOST_POINTS, sampled_points
 from modp_ti.inputs.point_cloud import projected_points
 from modp_ti.inputs.protocol import Progress
 from modp_ti.inputs.replay import PosedImage
@@ -33,8 +33,6 @@ from modp_ti.inputs.sources.undistortion import Intrinsics
 MOST_CLOUD_POINTS = 500_000
 # A depth image belongs to an image that was taken at most so long before or after it [s].
 LARGEST_DELAY = 0.05
-# Largest number of points of a frame. No two frames have one in common, so that more say little of the others.
-MOST = 400
 
 
 def world_points(bag: Bag, topic: str, tree: FrameTree, world: str, max_gap: float) -> NDArray[np.float64]:
@@ -184,7 +182,7 @@ def with_depth_points(
             damaged.append(f"{bag.path}: unreadable image of {topic.name}: {error}")
             continue
         depth = DepthMap(metres, metres > 0)
-        in_sensor, _ = sampled_points(depth, undistorter, index, min(most, MOST), farthest)
+        in_sensor, _ = sampled_points(depth, undistorter, index, min(most, MOST_POINTS), farthest)
         xyz = in_sensor @ T[:3, :3].T + T[:3, 3]
         ids = index * IDS_PER_FRAME + np.arange(len(xyz), dtype=np.int64)
         points = projected_points(xyz, ids, frame.undistorter, frame.T_camera_world)

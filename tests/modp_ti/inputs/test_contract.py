@@ -24,7 +24,8 @@ KINDS = [kind for kind, sample in SAMPLES.items() if sample.is_tracker]
 # Kinds whose files hold neither points nor depths, so that so small pictures give none.
 WITHOUT_POINTS = ("nerfcapture", "euroc", "kitti")
 # Kinds whose points are those of a depth sensor.
-WITH_DEPTHS = ("record3d", "scanner_app", "polycam", "stray_scanner", "arkitscenes", "scannet", "bag_depth")
+APPS = ("record3d", "scanner_app", "polycam", "stray_scanner")
+WITH_DEPTHS = (*APPS, "replica_depth", "arkitscenes", "scannet", "bag_depth")
 # Their files hold coordinates as float32, which are lost far from the origin.
 NEAR_ALONE = ("transforms", "ply", "modp", *(kind for kind in KINDS if kind.startswith("bag_")))
 BY_NAMES = ("colmap_text", "colmap", "transforms", "modp")
