@@ -102,7 +102,9 @@ class DeviceCameras(Cameras):
         # By frame index: the keyframe's array that was sent, and its numbers on the device.
         self._poses: dict[int, tuple[NDArray, torch.Tensor]] = {}
         self._exposures: dict[int, tuple[NDArray, torch.Tensor]] = {}
+        # Keyframes whose numbers have changed on the device.
         self._moved: dict[int, Keyframe] = {}
+        self._exposed: dict[int, Keyframe] = {}
         self._pose_kernel, self._exposure_kernel = CompiledKernel(self._step_pose), CompiledKernel(self._step_exposure)
         self.log_betas = tuple(float(np.log(beta)) for beta in Moments.BETAS)
 
@@ -115,20 +117,22 @@ class DeviceCameras(Cameras):
         self._pose_kernel(self._pose(view), self.projection.tangents, float(rate), int(is_last))
 
     def step_exposure(self, view: Keyframe, weight: float, is_last: bool) -> None:
-        self._moved[view.index] = view
+        self._exposed[view.index] = view
         settings = self.exposure.settings
         pull = 2.0 * weight * settings.regularisation
         numbers = self._exposure(view), self.photometric.gradient
         self._exposure_kernel(*numbers, float(settings.learning_rate), float(pull), int(is_last))
 
     def settle(self) -> None:
-        for table, end, read in ((self._poses, SUM, self._read_pose), (self._exposures, E_SUM, self._read_exposure)):
-            views = [view for index, view in self._moved.items() if index in table]
+        for views, table, end, read in (
+            (self._moved, self._poses, SUM, self._read_pose),
+            (self._exposed, self._exposures, E_SUM, self._read_exposure),
+        ):
             if views:
-                rows = torch.stack([table.pop(view.index)[1][:end] for view in views]).cpu().numpy()
-                for view, row in zip(views, rows.astype(np.float64), strict=True):
+                rows = torch.stack([table.pop(index)[1][:end] for index in views]).cpu().numpy()
+                for view, row in zip(views.values(), rows.astype(np.float64), strict=True):
                     read(view, row)
-        self._moved.clear()
+                views.clear()
 
     def _read_pose(self, view: Keyframe, row: NDArray[np.float64]) -> None:
         T = np.eye(4)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from fields.map.gaussians import GaussianField
 from fields.map.keyframes import KeyframeStore
+from fields.runtime.backend import initialise
 from pipelines.companions.exposure import ExposureRefinement
 from pipelines.optimise.cameras import make_cameras
 from pipelines.optimise.poses import PoseRefinement
@@ -52,3 +53,18 @@ def test_what_is_not_finite_or_runs_away_is_undone_and_counted(on_both: Callable
         np.testing.assert_allclose(gpu["pose"], cpu["pose"], atol=1e-5)
         np.testing.assert_allclose(gpu["moments"], cpu["moments"], rtol=1e-4, atol=1e-5)
         assert cpu["moments"][-1] == remembered
+
+
+def test_a_step_of_the_exposure_leaves_the_pose(gpu: str) -> None:
+    initialise(gpu)
+    renderer = Renderer(GaussianField(0, max_gaussians=1 << 12), 64, 48)
+    view = KeyframeStore().append(frame(1))
+    view.exposure = np.eye(3, 4)
+    cameras = make_cameras(renderer, PoseRefinement(), ExposureRefinement(ExposureSettings()))
+    pose = view.T_camera_world
+    cameras.render(view, view.image(0), 0.1, exact=True)
+    renderer.backward()
+    cameras.step_exposure(view, 1.0, is_last=True)
+    cameras.settle()
+    assert view.T_camera_world is pose
+    assert cameras.exposure.moments.steps == {view.index: 1}
