@@ -8,7 +8,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -28,6 +28,7 @@ from modp_ti.outputs.evaluation import FrameScore, MapVersion, summary
 from modp_ti.outputs.formats.dataset import image_names, write_image
 from modp_ti.outputs.formats.run_files import NOT_ALWAYS, write_map, write_scores
 from modp_ti.outputs.formats.splats_ply import check_splats
+from modp_ti.outputs.locating.vertical import by_gravity
 from modp_ti.outputs.measuring import WORLD, read_world
 from modp_ti.outputs.report.page import Album, ReportedRun, write_report
 from modp_ti.outputs.report.record import RunRecord
@@ -65,6 +66,8 @@ class Results:
         self._names = image_names(frames.name, config.export.images)
         self._album = Album.of(frames.held_out)
         self._survey = ErrorSurvey(held_out=any(frames.held_out))
+        self._world = {"unit": "m", "by": "the recording's poses"} if config.tracker.in_metres else {}
+        self._world = self._world if config.onto is None else read_world(config.onto)
         # Of some frames, what they see of the map; by place among all frames.
         mapped = [place for place, held_out in enumerate(frames.held_out) if not held_out]
         looks = mapped[:: -(-len(mapped) // LOOKS) or 1]
@@ -81,10 +84,8 @@ class Results:
         with appearing(self.config.output, OUTDATED) as self.folder:
             yield
             dump_scene(self.config, self.folder / "config.yaml")
-            world = {"unit": "m", "by": "the recording's poses"} if self.config.tracker.in_metres else {}
-            world = world if self.config.onto is None else read_world(self.config.onto)
-            if world:
-                replace_text(self.folder / WORLD, json.dumps(world, indent=2) + "\n")
+            if self._world:
+                replace_text(self.folder / WORLD, json.dumps(self._world, indent=2) + "\n")
 
     @contextmanager
     def writing_figures(self) -> Iterator[None]:
@@ -103,6 +104,12 @@ class Results:
     def write_map(self, version: MapVersion, pipeline: Pipeline) -> None:
         """Write the map. Raises InputError if `splats.ply` is not read back as it was written."""
         self._write_map(self.folder, version, pipeline)
+        with suppress(InputError):  # the recording may be gone by now
+            path = self.config.source.path if self.config.onto is None else None
+            found = by_gravity(path, np.array(self.frames.timestamp), np.stack(version.trajectory))
+            if found is not None:
+                tilt = float(np.degrees(found.deviation))
+                self._world |= {"down": found.down.tolist(), "down_deviation": tilt}
         check_splats(self.folder / "splats.ply", version.gaussians, self.frames.from_origin)
 
     def elsewhere(self, version: MapVersion, pipeline: Pipeline) -> str:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -21,7 +22,7 @@ from modp_ti.outputs.playback.finished_run import FinishedRun
 from modp_ti.outputs.playback.map_renderer import MapRenderer, start_device
 from modp_ti.outputs.playback.run_frames import run_settings
 from modp_ti.outputs.progress import ProgressLine
-from modp_ti.outputs.splat_page.page import levelled
+from modp_ti.outputs.splat_page.page import level, levelled
 
 # Most views that are rendered, evenly spaced, and their longest side [px].
 VIEWS, LONGEST = 64, 1280
@@ -56,15 +57,30 @@ class Vertical:
 def vertical(run: FinishedRun, line: ProgressLine) -> Vertical | None:
     """Return the direction of down in a finished map; None if neither gravity nor enough vertical edges are known."""
     held, path = levelled(run).R[1], run_settings(run).source.path
-    gravity = None if path is None else recorded_gravity(path, run.timestamps)
-    if gravity is not None and (found := mean_direction(run.poses, gravity, held)) is not None:
-        return Vertical(*found, "gravity")
+    if (found := by_gravity(path, run.timestamps, run.poses)) is not None:
+        return found
     start_device("auto")
     shots = [(run.cameras[place].within(LONGEST), run.poses[place]) for place in run.spread(VIEWS)]
     renderer = MapRenderer(run.gaussians, LONGEST, LONGEST, run.record.near)
     views = line.through("looking for vertical edges", shots, len(shots))
     found = common_direction([edges(renderer.picture(*shot), *shot) for shot in views], held)
     return None if found is None else Vertical(*found, "vertical edges")
+
+
+def by_gravity(path: Path | None, times: NDArray[np.float64], poses: NDArray[np.float64]) -> Vertical | None:
+    """Return the direction of down by the gravity that a recording holds; None if it holds none.
+
+    Args:
+        path: The recording, None for a live one.
+        times: Times of its frames (F,) [s].
+        poses: Their T_camera_world (F, 4, 4).
+
+    Raises:
+        InputError: If the recording is damaged.
+    """
+    gravity = None if path is None else recorded_gravity(path, times)
+    found = None if gravity is None else mean_direction(poses, gravity, level(poses, 1.0).R[1])
+    return None if found is None else Vertical(*found, "gravity")
 
 
 def mean_direction(
