@@ -13,9 +13,9 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cached_property
 from multiprocessing import Pipe
 from pathlib import Path
 from typing import ClassVar
@@ -141,6 +141,9 @@ class TrackingProcess(Tracker):
         with tempfile.TemporaryFile() as board, theirs:
             self._board = CountsBoard.of(board.fileno())
             self._process = _started([theirs.fileno(), board.fileno()])
+        opening = ThreadPoolExecutor(1)  # meanwhile, as a video is decoded once to be opened
+        self._reader = opening.submit(self._opened_images)
+        opening.shutdown(wait=False)
         self._interrupt = RecordingInterrupt(self._interrupted)
         self._progress = progress
         self._notes: list[str] = []
@@ -215,7 +218,7 @@ class TrackingProcess(Tracker):
             message = self._receive()
             if isinstance(message, dict):
                 self._taken += 1
-                yield TrackedFrame(**message, **vars(self._reader.read(message["name"], self.undistorter)))
+                yield TrackedFrame(**message, **vars(self._reader.result().read(message["name"], self.undistorter)))
             elif isinstance(message, CameraRevised):
                 self._undistorter = message.intrinsics.undistorter(self._scale)
             elif isinstance(message, PoseCorrection):
@@ -224,11 +227,10 @@ class TrackingProcess(Tracker):
                 self._end(message)
 
     def pictures(self, names: Sequence[str]) -> Iterator[tuple[str, Picture]]:
-        return pictures_again(self._reader, ((name, self.undistorter) for name in names))
+        return pictures_again(self._reader.result(), ((name, self.undistorter) for name in names))
 
-    @cached_property
-    def _reader(self) -> FrameReader:
-        """Reads the images in this process."""
+    def _opened_images(self) -> FrameReader:
+        """Open the images in this process."""
         if self._kept is not None:
             return FrameReader(StoredFrames(Path(self._kept.name)), self._config.source)
         return FrameReader(open_source(self._config.source.model_copy(update={"realtime": False})), self._config.source)
@@ -245,8 +247,8 @@ class TrackingProcess(Tracker):
             self._process.wait()
         self._connection.close()  # last, as another thread may read from it until the process has ended
         self._interrupt.give_back()
-        if "_reader" in vars(self):
-            self._reader.images.close()
+        if self._reader.done() and self._reader.exception() is None:
+            self._reader.result().images.close()
         if self._kept is not None:
             self._kept.cleanup()
 
