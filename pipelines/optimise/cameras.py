@@ -109,7 +109,9 @@ class DeviceCameras(Cameras):
         self.log_betas = tuple(float(np.log(beta)) for beta in Moments.BETAS)
 
     def render(self, view: Keyframe, image: ImageLevel, near: float, exact: bool) -> None:
-        self.renderer.forward(image.camera, self._pose(view)[:12], near, exact)
+        T, stepped = view.T_camera_world, self._poses.get(view.index)
+        pose = stepped[1][:12] if stepped is not None and stepped[0] is T else T
+        self.renderer.forward(image.camera, pose, near, exact)
         self.renderer.develop(None if view.exposure is None else self._exposure(view)[:12], view.vignette)
 
     def step_pose(self, view: Keyframe, rate: float, is_last: bool) -> None:
@@ -148,7 +150,7 @@ class DeviceCameras(Cameras):
         self.exposure.safeguards.exposure_steps += int(row[E_CAUGHT])
 
     def _pose(self, view: Keyframe) -> torch.Tensor:
-        """The numbers of a keyframe's pose on the device."""
+        """The numbers of a keyframe's pose on the device, not of a copy at another level."""
         sent = self._poses.get(view.index)
         if sent is None or sent[0] is not view.T_camera_world:
             W = pixel_metric(view.camera, view.median_depth)

@@ -24,9 +24,11 @@ AWAY = [(np.ones(6), 500.0)]  # px, of images 64 wide
 
 def stepped(steps: list[tuple[NDArray, float]]) -> dict[str, NDArray]:
     renderer = Renderer(GaussianField(0, max_gaussians=1 << 12), 64, 48)
-    view = KeyframeStore().append(frame(1))
+    view = KeyframeStore(levels=2).append(frame(1))
     poses = PoseRefinement()
     cameras = make_cameras(renderer, poses, ExposureRefinement(ExposureSettings()))
+    small = view.at_level(1)
+    cameras.render(small, small.image(0), 0.1, exact=True)  # steps are in pixels of the full size all the same
     for gradient, rate in steps:
         if type(cameras).__name__ == "Cameras":
             poses.step(view, gradient, rate)
