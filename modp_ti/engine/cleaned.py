@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fields.frames.tracked_frame import TrackedFrame
-from modp_ti.outputs.evaluation import keyframe_psnr, score_frame
+from modp_ti.engine.mapper import Mapper
+from modp_ti.inputs.protocol import Tracker
+from modp_ti.outputs.evaluation import MapVersion, keyframe_psnr, score_frame
 from pipelines.online import OnlineMapper
 from pipelines.whole.cleaning import faults, harmless
 
@@ -57,6 +59,23 @@ def cleaned(
         "before": round(before, 4),
         "after": round(after, 4),
     }
+
+
+def cleaned_at_the_end(mapper: Mapper, tracker: Tracker, version: MapVersion) -> dict[str, Any] | None:
+    """Remove the faults of the map of a run, and return what `cleaned` says; None if parts of it are on disk.
+
+    Args:
+        mapper: The mapper after the last frame.
+        tracker: Reads held-out frames again.
+        version: The map.
+    """
+    frames, online = mapper.frames, mapper.online
+    if len(online.gaussians) < len(version.gaussians["position"]):
+        return None
+    held_out = set(thinned([index for index, held in zip(frames.index, frames.held_out, strict=True) if held]))
+    poses = dict(zip(frames.index, version.trajectory, strict=True))
+    again = frames.again(tracker) if held_out else ()
+    return cleaned(online, [(frame, poses[frame.index]) for frame in again if frame.index in held_out])[1]
 
 
 def said(entry: dict[str, Any]) -> str:

@@ -34,7 +34,7 @@ from pipelines.settings import MappingSettings, RefineSettings
 
 FILE = "session.zip"
 # Version of the file. Others are refused.
-VERSION = 4
+VERSION = 5
 ABOUT = "about.json"
 AGAIN = "; record the session again"
 # What is written of a frame to `about.json`, and arrays of its points; arrays of a correction, and of its camera.

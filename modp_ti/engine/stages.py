@@ -16,7 +16,7 @@ from fields.geometry.camera import PinholeCamera
 from fields.runtime import process
 from fields.runtime.backend import describe, initialise
 from modp_ti.config.settings import SceneConfig
-from modp_ti.engine.cleaned import cleaned, said, thinned
+from modp_ti.engine.cleaned import cleaned_at_the_end, said
 from modp_ti.engine.interruption import Interruption
 from modp_ti.engine.mapper import Mapper, build_mapper
 from modp_ti.engine.parts import MergedParts
@@ -389,20 +389,7 @@ def finish_map(stream: MappedStream) -> FinishedMap:
         if config.mapping.clean == "auto" and config.mode != "offline":
             stage, last = list(versions.items())[-1]
             with line.working("looking for faults"):
-                entry = _clean(stream, last)
+                entry = cleaned_at_the_end(mapper, run.tracker, last)
+            run.say("mapping.clean: the map is larger than memory, and stays" if entry is None else said(entry))
             versions[stage] = replace(mapper.version(), view_renders=last.view_renders)
     return FinishedMap(stream, versions, breakdown, entry)
-
-
-def _clean(stream: MappedStream, version: MapVersion) -> dict[str, Any] | None:
-    """Remove the faults of the finished map, and return what `cleaned` says; None if parts of it are on disk."""
-    run, frames, mapper = stream.run, stream.mapper.frames, stream.mapper.online
-    if len(mapper.gaussians) < len(version.gaussians["position"]):
-        run.say("mapping.clean: the map is larger than memory, and stays as it is")
-        return None
-    held_out = set(thinned([index for index, held in zip(frames.index, frames.held_out, strict=True) if held]))
-    poses = dict(zip(frames.index, version.trajectory, strict=True))
-    again = frames.again(run.tracker) if held_out else ()
-    _, entry = cleaned(mapper, [(frame, poses[frame.index]) for frame in again if frame.index in held_out])
-    run.say(said(entry))
-    return entry

@@ -2,45 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from fields.frames.origin import shifted_poses
-from fields.geometry.se3 import camera_centres
 from modp_ti.files.errors import InputError
 from modp_ti.files.run_folder import list_files, refuse_foreign
-from modp_ti.outputs.formats.collision import boundary, write_octomap, write_ros_map, write_voxels
 from modp_ti.outputs.formats.compressed_splats import SPZ_VERSION, write_compressed_ply, write_spz, write_web_splat
 from modp_ti.outputs.formats.dataset import image_names, new_folder, rename_images, write_image, write_transforms
 from modp_ti.outputs.formats.gltf import write_splat_glb
 from modp_ti.outputs.formats.mesh import (
-    LEAST_OPACITY,
     MESH_SUFFIXES,
-    TRUNCATION,
-    SurfaceView,
-    extracted,
-    fused,
-    supported,
-    without_edges,
-    write_mesh,
     write_points,
 )
 from modp_ti.outputs.formats.sog import write_sog, write_sog_lod
-from modp_ti.outputs.formats.textured_mesh import painted, require_atlas, unwrapped, write_textured_mesh
+from modp_ti.outputs.formats.textured_mesh import require_atlas
 from modp_ti.outputs.formats.tileset import write_tileset
 from modp_ti.outputs.formats.usd import USD_SUFFIXES, write_usd
 from modp_ti.outputs.measuring import Ruler, read_world
 from modp_ti.outputs.playback.film import VIDEO_SUFFIXES, film, plan_flight
 from modp_ti.outputs.playback.finished_run import FinishedRun
-from modp_ti.outputs.playback.map_renderer import MapRenderer, eight_bits, start_device
+from modp_ti.outputs.playback.map_renderer import start_device
 from modp_ti.outputs.playback.plain_colours import with_plain_colours
 from modp_ti.outputs.playback.run_frames import kept_images, pictures
+from modp_ti.outputs.playback.surfaces import export_collision, export_mesh, walls_of
 from modp_ti.outputs.progress import ProgressLine
 from modp_ti.outputs.report.page import show_link_to_map
 from modp_ti.outputs.splat_page.page import (
@@ -51,26 +41,12 @@ from modp_ti.outputs.splat_page.page import (
     viewer_settings,
     write_splat_page,
 )
-from pipelines.surface.depth import DepthMatcher, DepthView, joined_depth
-from pipelines.surface.free_space import VoxelSpace, carved, reached, walkable
-from pipelines.surface.fusion import Placed
 from pipelines.whole.hierarchy import Hierarchy
 
 if TYPE_CHECKING:
-    from open3d.pybind.geometry import TriangleMesh
+    pass
 
 TEXTURED_NAME, PAGE = "mesh.glb", "map.html"
-# Edge of the mesh's voxels, and largest depth that is fused, both relative to the scene's depth.
-VOXEL, FARTHEST = 1 / 160, 4.0
-# Edge of the voxels of free space, and the longest straight way between two frames that a camera is taken to have gone,
-# both relative to the scene's depth.
-SPACE_VOXEL, JUMP = 1 / 50, 0.5
-# Most views that are fused, evenly spaced over the frames, and their longer side [px]. A pixel is then finer than the
-# mesh's voxels. The same of the pictures that a texture is painted from.
-SURFACE_VIEWS, LONGEST_SIDE = 300, 480
-PAINTED_VIEWS, LONGEST_PAINTED_SIDE = 100, 1024
-# The same of the views in which the page's walls are looked for, and most triangles of these.
-WALKED_VIEWS, WALKED_SIDE, WALKED_TRIANGLES = 100, 240, 10_000
 
 
 @dataclass(frozen=True)
@@ -172,7 +148,7 @@ def export_map(run: FinishedRun, format: str, output: Path | None, options: Expo
     return target
 
 
-# ---- points, splats, pages, data sets, videos --------------------------------------------------------------------
+# ---- points, splats, pages, data sets, surfaces, videos ----------------------------------------------------------
 
 
 def _points(run: FinishedRun, target: Path, options: ExportOptions, line: ProgressLine) -> None:
@@ -203,7 +179,7 @@ def _spz(run: FinishedRun, target: Path, options: ExportOptions, line: ProgressL
 def _page(run: FinishedRun, target: Path, options: ExportOptions, line: ProgressLine) -> None:
     """Write the page, and show the link to it in the run's report if it lies next to it under its default name."""
     upright, ruler = levelled(run), Ruler.of(run)
-    walls = _walls(run, options.device, line)
+    walls = walls_of(run, options.device, line)
     with line.working("writing the page"):
         if walls is not None and ruler.unit != "m":
             upright = replace(upright, scale=EYE_HEIGHT / (walls[2] - walls[1]))
@@ -250,140 +226,16 @@ def _write_images(run: FinishedRun, folder: Path, line: ProgressLine) -> list[st
     return names
 
 
-def _video(run: FinishedRun, target: Path, options: ExportOptions, line: ProgressLine) -> None:
-    film(run, plan_flight(run, "recorded"), target, "colour", options.device, line)
-
-
-# ---- the mesh ----------------------------------------------------------------------------------------------------
-
-
 def _mesh(run: FinishedRun, target: Path, options: ExportOptions, line: ProgressLine) -> None:
-    voxel = options.voxel or VOXEL * run.record.scene_depth
-    longest = LONGEST_PAINTED_SIDE if options.texture else LONGEST_SIDE
-    renderer = _loaded(run, longest, options.device, line)
-    views = _surface_views(run, renderer, line)
-    with line.working("fusing depth"):
-        grid = fused(views, voxel, FARTHEST * run.record.scene_depth)
-    with line.working("extracting the surface"):
-        mesh = supported(extracted(grid), views, TRUNCATION * voxel)
-    if options.texture:
-        with line.working("unwrapping the surface"):
-            flat = unwrapped(mesh)
-        places = [(run.cameras[index].within(longest), run.poses[index]) for index in run.spread(PAINTED_VIEWS)]
-        shots = ((*place, renderer.view(*place).colour) for place in line.through("painting", places, len(places)))
-        write_textured_mesh(target, painted(flat, shots))
-        return
-    if target.suffix.lower() == ".ply" and run.record.origin.any():  # its coordinates are double
-        mesh.translate(run.record.origin)
-    write_mesh(target, mesh)
+    export_mesh(run, target, options.voxel, options.texture, options.device, line)
 
 
 def _collision(run: FinishedRun, target: Path, options: ExportOptions, line: ProgressLine) -> None:
-    """Write what is free and what is solid, in axes whose z points up."""
-    with new_folder(target) as folder:
-        views = _surface_views(run, _loaded(run, LONGEST_SIDE, options.device, line), line)
-        seen = [(view.camera, view.T_camera_world, view.depth) for view in views]
-        with line.working("carving space"):
-            try:
-                space = _carved(run, seen, options.voxel)
-            except ValueError as error:
-                raise InputError(f"{error}; use larger ones (--voxel)") from None
-        places = camera_centres(run.poses)
-        height = float(np.median(places @ space.R_grid_world[2]))
-        floor = space.floor(height)
-        if options.height is not None:
-            if floor is None:
-                raise InputError("--height: no floor was seen below the cameras; leave it out for the cameras' height")
-            height = floor + options.height
-        with line.working("extracting the surface"):
-            write_voxels(folder / "voxels.npz", space, run.record.origin, floor)
-            write_ros_map(folder, space, height)
-            write_octomap(folder / "voxels.bt", space)
-            write_mesh(folder / "mesh.glb", boundary(space, reached(space, places)))
+    export_collision(run, target, options.voxel, options.height, options.device, line)
 
 
-def _carved(run: FinishedRun, seen: Sequence[Placed], voxel: float | None) -> VoxelSpace:
-    """Carve space with depth maps of a run. Raises ValueError if there would be too many voxels."""
-    depth, R = run.record.scene_depth, levelled(run).R
-    way = camera_centres(run.poses)[run.way]
-    jumps = np.flatnonzero(np.linalg.norm(np.diff(way, axis=0), axis=1) > JUMP * depth) + 1
-    R_grid_world = np.stack([R[0], R[2], -R[1]])
-    return carved(seen, np.split(way, jumps), R_grid_world, voxel or SPACE_VOXEL * depth, FARTHEST * depth)
-
-
-def _walls(run: FinishedRun, device: str, line: ProgressLine) -> tuple[TriangleMesh, float, float] | None:
-    """Return what bounds the way of someone who walks in the map, and the heights of the floor and the cameras.
-
-    They come from the map's own depth. Without a floor, or if the map is too large, there are none.
-    """
-    renderer, seen = _loaded(run, WALKED_SIDE, device, line), []
-    places = camera_centres(run.poses)
-    with line.working("looking for the floor and walls"):
-        for index in run.spread(WALKED_VIEWS):
-            camera, T = run.cameras[index].within(WALKED_SIDE), run.poses[index]
-            depth = renderer.view(camera, T).expected_depth(LEAST_OPACITY).astype(np.float32)
-            seen.append((camera, T, without_edges(depth)))
-        try:
-            space = _carved(run, seen, None)
-        except ValueError:
-            return None
-        up = space.R_grid_world[2]
-        height = float(np.median(places @ up))
-        floor = space.floor(height)
-        if floor is None:
-            return None
-        mesh = boundary(space, walkable(space, places, floor), WALKED_TRIANGLES)
-        heights = run.gaussians["position"].astype(np.float64) @ up
-        return mesh, float(np.median(heights[np.abs(heights - floor) <= space.voxel])), height
-
-
-def _loaded(run: FinishedRun, longest: int, device: str, line: ProgressLine) -> MapRenderer:
-    """Load the map for pictures of its frames with at most `longest` pixels on a side."""
-    cameras = [run.cameras[index].within(longest) for index in run.mapped]
-    with line.working("loading the map"):
-        gaussians = run.gaussians
-        start_device(device)
-    width, height = max(camera.width for camera in cameras), max(camera.height for camera in cameras)
-    return MapRenderer(gaussians, width, height, run.record.near)
-
-
-def _surface_views(run: FinishedRun, renderer: MapRenderer, line: ProgressLine) -> list[SurfaceView]:
-    """Return the surface's depth and colour from the mapped frames.
-
-    The map's depth is corrected by matching the frames' images. If these are no longer available, renders of the map
-    are matched instead, which are less sharp.
-    """
-    chosen = run.spread(SURFACE_VIEWS)
-    grey: list[NDArray[np.uint8]] = []
-    try:
-        images = pictures(run, chosen, line.prepare)
-        for image in line.through("reading images", images, len(chosen)):
-            grey.append(_grey(eight_bits(image.image)))
-    except InputError as error:
-        grey = []
-        line.note(f"note: matching the map's own pictures, since the images cannot be read: {error}")
-    shown, views = [], []
-    placed = [(run.cameras[index].within(LONGEST_SIDE), run.poses[index]) for index in chosen]
-    for number, (camera, T) in enumerate(line.through("rendering", placed, len(placed))):
-        view = renderer.view(camera, T)
-        shown.append(eight_bits(view.colour))
-        image = grey[number] if grey else _grey(shown[-1])
-        image = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-        depth = view.expected_depth(LEAST_OPACITY).astype(np.float32)
-        views.append(DepthView(camera, T, np.asarray(image / np.float32(255.0), dtype=np.float32), depth))
-    matcher = DepthMatcher(views)
-    matched = [matcher.matched(index) for index in line.through("matching images", range(len(views)), len(views))]
-    joined = joined_depth(
-        views, matched, matcher.neighbours, line.through("joining depth", range(len(views)), len(views))
-    )
-    return [
-        SurfaceView(view.camera, view.T_camera_world, without_edges(depth), picture / np.float32(255.0))
-        for view, depth, picture in zip(views, joined, shown, strict=True)
-    ]
-
-
-def _grey(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    return np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+def _video(run: FinishedRun, target: Path, options: ExportOptions, line: ProgressLine) -> None:
+    film(run, plan_flight(run, "recorded"), target, "colour", options.device, line)
 
 
 FORMATS = {

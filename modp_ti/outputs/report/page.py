@@ -19,7 +19,7 @@ from modp_ti.files.atomic import replace_text
 from modp_ti.files.errors import InputError
 from modp_ti.outputs.evaluation import FrameScore, MapVersion, summary, umeyama
 from modp_ti.outputs.playback.map_renderer import eight_bits
-from modp_ti.outputs.report import facts, plots
+from modp_ti.outputs.report import facts, from_above, plots
 from modp_ti.outputs.report.record import RunRecord
 from modp_ti.outputs.report.where_wrong import ErrorSurvey, Needles
 from pipelines.whole.coverage import SeenDepth, where_to_film, widest_angles
@@ -227,8 +227,8 @@ def _drawings(run: ReportedRun) -> dict[str, str]:
     """Return the SVG of every drawing that the run has data for."""
     last = list(run.versions.values())[-1]
     centres, frames, online = camera_centres(last.trajectory), run.record.frames, run.config.mode == "online"
-    plan = plots.plan_of(last.trajectory)
-    floor = plots.floor_plan(plan, last.gaussians, centres)
+    plan = from_above.plan_of(last.trajectory)
+    floor = from_above.floor_plan(plan, last.gaussians, centres)
     truth = None
     if len(run.truth) == len(centres) >= 3:
         true = camera_centres(run.truth)
@@ -243,8 +243,8 @@ def _drawings(run: ReportedRun) -> dict[str, str]:
         "pace": any(note.lag is not None for note in frames) and (plots.pace, frames),
         "steps": bool(run.record.steps) and (plots.steps, run.record.steps),
         "place": bool(run.survey.by_depth()) and (plots.places, *run.survey.by_place(), run.survey.aspect),
-        "thin": bool(run.seen) and (plots.coverage, *_thin(run, plan, floor[0], centres)),
-        "trajectory": (plots.trajectory, plan, run.tracked, last.trajectory, run.keyframes, floor, truth),
+        "thin": bool(run.seen) and (from_above.coverage, *_thin(run, plan, floor[0], centres)),
+        "trajectory": (from_above.trajectory, plan, run.tracked, last.trajectory, run.keyframes, floor, truth),
         "poses": online and (plots.pose_changes, run.tracked, ways, run.scene_depth),
     }
     return {name: plots.svg(*drawing) for name, drawing in drawn.items() if drawing}
@@ -253,7 +253,7 @@ def _drawings(run: ReportedRun) -> dict[str, str]:
 def _thin(
     run: ReportedRun, plan: NDArray[np.float64], floor: NDArray[np.float64], centres: NDArray[np.float64]
 ) -> tuple[Any, ...]:
-    """Return the values of `plots.coverage`."""
+    """Return the values of `from_above.coverage`."""
     points = floor @ plan
     angles = widest_angles(points, run.seen, run.scene_depth)
     film = where_to_film(points, angles, run.seen)

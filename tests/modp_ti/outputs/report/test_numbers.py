@@ -11,8 +11,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from modp_ti.outputs.evaluation import FrameScore
+from modp_ti.outputs.report.from_above import floor_plan, plan_of
 from modp_ti.outputs.report.page import FULL_SCALE, Album, picked
-from modp_ti.outputs.report.plots import binned, floor_plan, frame_rate, plan_of, shifts_and_turns
+from modp_ti.outputs.report.plots import binned, frame_rate, shifts_and_turns
 from modp_ti.outputs.report.record import WINDOW, FrameNote, RunRecord, retention
 from pipelines.pipeline import FrameReport
 from tests.modp_ti.outputs.report.made_up_run import cameras
