@@ -117,7 +117,7 @@ class RealtimeRun(ClockedRun):
         watch = mapper.pipeline.stopwatch
         while True:
             self._count_aside()
-            while not ahead.ready():
+            while not (ahead.ready() or self._waiting()):  # what waits in the tracker comes soon
                 stop.check()
                 if not self._step_further(mapper):
                     break  # there is no map yet

@@ -217,8 +217,9 @@ class TrackingProcess(Tracker):
         while not self._ended:
             message = self._receive()
             if isinstance(message, dict):
+                frame = TrackedFrame(**message, **vars(self._reader.result().read(message["name"], self.undistorter)))
                 self._taken += 1
-                yield TrackedFrame(**message, **vars(self._reader.result().read(message["name"], self.undistorter)))
+                yield frame
             elif isinstance(message, CameraRevised):
                 self._undistorter = message.intrinsics.undistorter(self._scale)
             elif isinstance(message, PoseCorrection):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
@@ -160,6 +161,28 @@ def test_the_map_is_optimised_while_no_frame_waits() -> None:
     assert realtime.further == len(done) >= 3
     assert np.diff(done[:3]).tolist() == [SETTINGS.views.global_views] * 2
     assert len(mapper.frames) == 2
+
+
+def test_no_further_step_is_made_while_frames_wait_in_the_tracker() -> None:
+    """They are only not read yet: the reading of the second one ends late."""
+    frames = [frame(i) for i in range(2)]
+    tracker = WallTracker([], LiveCounts(2, 2, 0, 0, 1, newest=100.0))
+    realtime = RealtimeRun(SETTINGS, tracker)
+    mapper, mapped_first = new_mapper(realtime), threading.Event()
+
+    def read() -> Iterator[TrackedFrame]:
+        yield frames[0]
+        mapped_first.wait(PATIENCE)
+        time.sleep(0.3)  # in which dozens of steps could be made
+        yield frames[1]
+
+    with FramesAhead(read(), 2) as ahead:
+        for event in realtime.events(ahead, mapper, never(), lambda: None):
+            realtime.add(mapper, event)
+            mapped_first.set()
+            if event.index == 1:
+                break
+    assert realtime.further == 0
 
 
 def test_corrections_behind_each_other_move_the_map_once() -> None:
