@@ -154,6 +154,8 @@ class ImageBuffers:
         self.width, self.height = width, height
         self._clear()
 
+    # Loops over a plane, since many GPUs start at most 65,535 groups of 128 threads by Vulkan.
+
     @ti.kernel
     def _clear(self):
         for i in range(self.plane):
@@ -162,19 +164,21 @@ class ImageBuffers:
             self.depth_grad[i] = 0.0
             self.opacity_grad[i] = 0.0
             self.valid[i] = 0.0
-        for i in range(3 * self.plane):
-            self.colour[i] = 0.0
-            self.colour_grad[i] = 0.0
-            self.reference[i] = 0.0
-            self.ssim[i] = 0.0
-        for i in range(9 * self.plane):
-            self.ssim_partial[i] = 0.0
+            for c in ti.static(range(3)):
+                self.colour[c * self.plane + i] = 0.0
+                self.colour_grad[c * self.plane + i] = 0.0
+                self.reference[c * self.plane + i] = 0.0
+                self.ssim[c * self.plane + i] = 0.0
+            for c in ti.static(range(9)):
+                self.ssim_partial[c * self.plane + i] = 0.0
 
     @ti.kernel
     def clip_colour(self):
         """Clip the rendered image to [0, 1]."""
-        for i in range(3 * self.plane):
-            self.colour[i] = ti.min(ti.max(self.colour[i], 0.0), 1.0)
+        for i in range(self.plane):
+            for c in ti.static(range(3)):
+                at = c * self.plane + i
+                self.colour[at] = ti.min(ti.max(self.colour[at], 0.0), 1.0)
 
     # ---- to and from NumPy -----------------------------------------------------------------------------------
 

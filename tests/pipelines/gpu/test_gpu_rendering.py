@@ -14,6 +14,7 @@ from fields.buffers.device_pairs import TILE_HEIGHT, TILE_WIDTH, tile_count
 from fields.buffers.tiles import TilePairs
 from fields.geometry.camera import PinholeCamera
 from fields.map.gaussians import GaussianField
+from fields.runtime.backend import initialise
 from fields.runtime.engine import ti
 from pipelines.render.cpu.binning import Binning
 from pipelines.render.formulas import OPAQUE
@@ -191,3 +192,13 @@ def test_a_gradient_where_pairs_were_dropped_is_that_of_what_was_drawn(
     for value in gradients.values():
         assert np.isfinite(value).all()
         assert (value[order[drawn[-1] + 1 :]] == 0).all()
+
+
+def test_images_of_1280x720_are_rendered(gpu: str) -> None:
+    """More numbers than many drivers start threads for at once."""
+    initialise(gpu)
+    camera = CAMERA.resized(1280, 720)
+    renderer = Renderer(GaussianField(0, max_gaussians=1 << 10), camera.width, camera.height)
+    renderer.gaussians.load(random_gaussians(50, seed=8, camera=camera))
+    view = renderer.render(camera, POSE, NEAR)
+    assert view.opacity.shape == (720, 1280) and view.opacity.max() > 0.5
