@@ -183,7 +183,8 @@ def _telemetry(video: Path) -> Iterator[tuple[bytes, tuple[float, ...]]]:
         return
     options = {"format_whitelist": CONTAINERS, "protocol_whitelist": "file"}
     with av.open(f"file:{video}", options=options, metadata_errors="replace") as container:
-        for packet in container.demux(container.streams.data):
+        # Without streams, PyAV would read the packets of all.
+        for packet in container.demux(container.streams.data) if container.streams.data else ():
             if packet.pts is not None and packet.time_base and (data := bytes(packet))[:4] == b"DEVC":
                 yield from _samples(
                     data, float(packet.pts * packet.time_base), float((packet.duration or 0) * packet.time_base)
